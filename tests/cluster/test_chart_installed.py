@@ -1,4 +1,4 @@
-"""The chart installed by a real helm into a cluster that has nothing of Wayside yet."""
+"""The chart installed by a real helm into a cluster without any objects of Wayside."""
 
 from __future__ import annotations
 
@@ -55,24 +55,24 @@ ALL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def bare() -> Iterator[ControlPlane]:
-    """A control plane without the CRDs: those are the chart's matter."""
+def empty_control_plane() -> Iterator[ControlPlane]:
+    """A control plane without the CRDs, which the chart installs."""
     with ControlPlane(ensure_binaries()) as running:
         yield running
 
 
 @pytest.fixture
-def there(bare: ControlPlane, request: pytest.FixtureRequest) -> Iterator[Api]:
+def restricted_api(empty_control_plane: ControlPlane, request: pytest.FixtureRequest) -> Iterator[Api]:
     """An administrator's client for a fresh namespace under the restricted Pod Security Standard."""
-    with fresh_namespace(bare.api(), request.node.name) as name:
-        bare.api().patch("Namespace", name, {"metadata": {"labels": PODS_ARE_RESTRICTED}})
-        api = bare.api(name)
-        wait_until(lambda: takes(api, UNRESTRICTED), lambda taken: not taken, what="the standard is in force")
+    with fresh_namespace(empty_control_plane.api(), request.node.name) as name:
+        empty_control_plane.api().patch("Namespace", name, {"metadata": {"labels": PODS_ARE_RESTRICTED}})
+        api = empty_control_plane.api(name)
+        wait_until(lambda: takes(api, UNRESTRICTED), lambda taken: not taken, what="the standard is enforced")
         yield api
 
 
 def takes(api: Api, manifest: Object) -> bool:
-    """Whether the API server would take it."""
+    """Whether the API server would accept the manifest."""
     try:
         api.apply(manifest, dry_run=True)
     except ApiError as error:
@@ -83,14 +83,14 @@ def takes(api: Api, manifest: Object) -> bool:
 
 
 @pytest.fixture
-def helm(bare: ControlPlane, there: Api, tmp_path: Any) -> Iterator[Helm]:
-    made = Helm(ensure_tools().helm, tmp_path / "home", bare.kubeconfig)
+def helm(empty_control_plane: ControlPlane, restricted_api: Api, tmp_path: Any) -> Iterator[Helm]:
+    made = Helm(ensure_tools().helm, tmp_path / "home", empty_control_plane.kubeconfig)
     yield made
-    made("uninstall", RELEASE, "--namespace", there.namespace, "--ignore-not-found")
-    remove_crds(there, CRD_NAMES)
+    made("uninstall", RELEASE, "--namespace", restricted_api.namespace, "--ignore-not-found")
+    remove_crds(restricted_api, CRD_NAMES)
 
 
-def ours(api: Api, *kinds: str) -> list[Object]:
+def release_objects(api: Api, *kinds: str) -> list[Object]:
     return [each for kind in kinds for each in api.list(kind, labels="app.kubernetes.io/part-of=wayside")]
 
 
@@ -102,62 +102,68 @@ def pods(api: Api, component: str) -> list[Object]:
     return api.list("Pod", labels=f"app.kubernetes.io/component={component}")
 
 
-def test_an_upgrade_changes_the_objects_and_an_uninstall_removes_all_but_the_crds(helm: Helm, there: Api) -> None:
-    install(helm, there, ALL)
+def test_an_upgrade_changes_the_objects_and_an_uninstall_removes_all_but_the_crds(
+    helm: Helm, restricted_api: Api
+) -> None:
+    install(helm, restricted_api, ALL)
     for component, count in (("manager", 2), ("router", 1)):
         # The restricted standard is enforced, so only pods that meet it come into being.
-        wait_for_pods(there, component, count)
-    town = there.get("Detector", "town")
+        wait_for_pods(restricted_api, component, count)
+    town = restricted_api.get("Detector", "town")
     assert town["metadata"]["labels"]["a"] == "b"
     assert town["spec"]["mode"] == "Standalone"
-    assert there.get("EventRule", "one")["spec"]["when"] == EVENT_RULE["spec"]["when"]
-    filled = {"data": {"ca.crt": "YQ=="}}  # as a manager does
-    there.patch("Secret", f"{RELEASE}-webhook-certificates", filled)
+    assert restricted_api.get("EventRule", "one")["spec"]["when"] == EVENT_RULE["spec"]["when"]
+    filled = {"data": {"ca.crt": "YQ=="}}  # written by a manager
+    restricted_api.patch("Secret", f"{RELEASE}-webhook-certificates", filled)
 
-    install(helm, there, ALL | {"manager": {"replicas": 1}}, "upgrade")
-    kept = there.get("Secret", f"{RELEASE}-webhook-certificates")["data"]
+    install(helm, restricted_api, ALL | {"manager": {"replicas": 1}}, "upgrade")
+    kept = restricted_api.get("Secret", f"{RELEASE}-webhook-certificates")["data"]
     assert kept == filled["data"], "an upgrade keeps the certificates"
-    assert there.find("PodDisruptionBudget", f"{RELEASE}-manager") is None
-    assert there.get("Detector", "town")["metadata"]["uid"] == town["metadata"]["uid"], (
-        "it is taken over, not recreated"
+    assert restricted_api.find("PodDisruptionBudget", f"{RELEASE}-manager") is None
+    assert restricted_api.get("Detector", "town")["metadata"]["uid"] == town["metadata"]["uid"], (
+        "the Detector is updated, not recreated"
     )
-    install(helm, there, ALL | {"eventRules": []}, "upgrade")
-    there.wait_gone("EventRule", "one")
+    install(helm, restricted_api, ALL | {"eventRules": []}, "upgrade")
+    restricted_api.wait_gone("EventRule", "one")
 
-    helm("uninstall", RELEASE, "--namespace", there.namespace)
-    there.wait_gone("Detector", "town")
+    helm("uninstall", RELEASE, "--namespace", restricted_api.namespace)
+    restricted_api.wait_gone("Detector", "town")
     left = sorted(installed_kinds() - {"CustomResourceDefinition"})
-    wait_until(lambda: names(ours(there, *left)), lambda found: not found, what="nothing else of the release is left")
-    assert len(ours(there, "CustomResourceDefinition")) == 5
-    install(helm, there, {})  # and the CRDs that stayed are taken over by the next release
+    wait_until(
+        lambda: names(release_objects(restricted_api, *left)),
+        lambda found: not found,
+        what="nothing else of the release is left",
+    )
+    assert len(release_objects(restricted_api, "CustomResourceDefinition")) == 5
+    install(helm, restricted_api, {})  # the next release adopts the kept CRDs
 
 
-def test_an_uninstall_without_an_earlier_upgrade_removes_all_objects_too(helm: Helm, there: Api) -> None:
-    install(helm, there, ALL | {"crds": {"keep": True}})
-    assert there.find("EventRule", "one") is not None
-    helm("uninstall", RELEASE, "--namespace", there.namespace)
-    there.wait_gone("EventRule", "one")
-    there.wait_gone("Detector", "town")
+def test_an_uninstall_without_an_earlier_upgrade_removes_all_objects_too(helm: Helm, restricted_api: Api) -> None:
+    install(helm, restricted_api, ALL | {"crds": {"keep": True}})
+    assert restricted_api.find("EventRule", "one") is not None
+    helm("uninstall", RELEASE, "--namespace", restricted_api.namespace)
+    restricted_api.wait_gone("EventRule", "one")
+    restricted_api.wait_gone("Detector", "town")
 
 
-def test_an_upgrade_of_the_crds_changes_no_stored_object(helm: Helm, there: Api, tmp_path: Path) -> None:
+def test_an_upgrade_of_the_crds_changes_no_stored_object(helm: Helm, restricted_api: Api, tmp_path: Path) -> None:
     """The same spec gives the same manifests, so no running application is applied again."""
     older = tmp_path / "older"
     older.mkdir()
     for file in CRDS.glob("*.yaml"):
         (older / file.name).write_text(yaml.safe_dump(_without_rules(yaml.safe_load(file.read_text()))))
-    assert apply_crds(there, older) == {}
-    stored = {kind: there.apply(one) for kind, one in VALID.items()}
-    assert apply_crds(there) == {}
+    assert apply_crds(restricted_api, older) == {}
+    stored = {kind: restricted_api.apply(one) for kind, one in VALID.items()}
+    assert apply_crds(restricted_api) == {}
     for kind, before in stored.items():
-        again = there.apply(VALID[kind])
+        again = restricted_api.apply(VALID[kind])
         assert again["metadata"]["uid"] == before["metadata"]["uid"]
         assert (kind, again["metadata"]["generation"]) == (kind, before["metadata"]["generation"])
         assert again["spec"] == before["spec"]
 
 
 def _without_rules(schema: Any) -> Any:
-    """A CRD as of an earlier version: without CEL rules, and with an owner of each key in free data."""
+    """A CRD as in an earlier version: without CEL rules, and with a field owner for each key of free-form data."""
     if isinstance(schema, list):
         return [_without_rules(each) for each in schema]
     if not isinstance(schema, dict):
@@ -166,11 +172,11 @@ def _without_rules(schema: Any) -> Any:
     return {key: _without_rules(value) for key, value in schema.items() if key not in left}
 
 
-def test_crds_that_are_not_kept_are_removed_too(helm: Helm, there: Api) -> None:
-    install(helm, there, {"crds": {"keep": False}})
-    helm("uninstall", RELEASE, "--namespace", there.namespace)
+def test_crds_that_are_not_kept_are_removed_too(helm: Helm, restricted_api: Api) -> None:
+    install(helm, restricted_api, {"crds": {"keep": False}})
+    helm("uninstall", RELEASE, "--namespace", restricted_api.namespace)
     for name in CRD_NAMES:
-        wait_crd_gone(there, name)
+        wait_crd_gone(restricted_api, name)
 
 
 @pytest.mark.parametrize(
@@ -183,14 +189,16 @@ def test_crds_that_are_not_kept_are_removed_too(helm: Helm, there: Api) -> None:
         {"router": {"enabled": True, "tls": {"enabled": False}, "accessControl": {"enabled": False}}},
     ],
 )
-def test_the_api_server_accepts_everything_that_is_rendered(helm: Helm, there: Api, values: dict[str, Any]) -> None:
-    rendered = helm.rendered(values, namespace=there.namespace).manifests
+def test_the_api_server_accepts_everything_that_is_rendered(
+    helm: Helm, restricted_api: Api, values: dict[str, Any]
+) -> None:
+    rendered = helm.rendered(values, namespace=restricted_api.namespace).manifests
     for each in rendered:
         if each["apiVersion"] == "wayside.dev/v1alpha1":
-            continue  # their kinds are among what is rendered; that they are taken, the installation shows
-        where = {"namespace": there.namespace} if not each["metadata"].get("namespace") else {}
+            continue  # custom resources are rendered too; the installation tests show that they are accepted
+        where = {"namespace": restricted_api.namespace} if not each["metadata"].get("namespace") else {}
         each["metadata"] |= where if each["kind"] not in CLUSTER_WIDE else {}
-        there.apply(each, dry_run=True)
+        restricted_api.apply(each, dry_run=True)
 
 
 CLUSTER_WIDE = {
@@ -206,7 +214,7 @@ CLUSTER_WIDE = {
 
 
 def installed_kinds() -> set[str]:
-    """What a release may consist of, beside what other programs' kinds are."""
+    """The kinds that a release may contain, without those of other programs."""
     return CLUSTER_WIDE | {
         "ConfigMap", "Deployment", "Lease", "NetworkPolicy", "Pod", "PodDisruptionBudget", "Role", "RoleBinding",
         "Secret", "Service", "ServiceAccount",
@@ -223,14 +231,18 @@ def wait_for_pods(api: Api, component: str, count: int) -> None:
 
 
 def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_it(
-    helm: Helm, there: Api, bare: ControlPlane, tmp_path: Path
+    helm: Helm, restricted_api: Api, empty_control_plane: ControlPlane, tmp_path: Path
 ) -> None:
-    mine = {"namespaces": [there.namespace], "allowedKinds": ["v1/ConfigMap"], "metrics": {"tlsSecretName": "metrics"}}
-    install(helm, there, {"manager": mine, "logFormat": "json"})
-    container = there.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
+    mine = {
+        "namespaces": [restricted_api.namespace],
+        "allowedKinds": ["v1/ConfigMap"],
+        "metrics": {"tlsSecretName": "metrics"},
+    }
+    install(helm, restricted_api, {"manager": mine, "logFormat": "json"})
+    container = restricted_api.get("Deployment", f"{RELEASE}-manager")["spec"]["template"]["spec"]["containers"][0]
     metrics, webhook = free_ports(2)
     certificates = tmp_path / "certificates"
-    service, hook = f"{RELEASE}-webhook.{there.namespace}.svc", f"{RELEASE}-{there.namespace}"
+    service, hook = f"{RELEASE}-webhook.{restricted_api.namespace}.svc", f"{RELEASE}-{restricted_api.namespace}"
     make_certificates(tmp_path / "metrics", ("127.0.0.1",))
     here = {
         "--metrics-port": str(metrics),
@@ -241,17 +253,17 @@ def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_i
     options = [word.split("=", 1) for word in container["args"][1:]]
     arguments = [f"{option}={here.get(option, value)}" for option, value in options]
     (logs := tmp_path / "logs").mkdir()
-    account = bare.kubeconfig_of_service_account(there.namespace, f"{RELEASE}-manager")
+    account = empty_control_plane.kubeconfig_of_service_account(restricted_api.namespace, f"{RELEASE}-manager")
     processes = Processes(logs, environment_of(account))
     try:
         manager = processes.start(*container["command"], container["args"][0], *arguments)
-        manager.wait_for_output("active: holds the Lease")  # the chart's, which is empty at first
-        first = trusted(there, hook)
+        manager.wait_for_output("active: holds the Lease")  # the Secret of the chart is empty at first
+        first = trusted(restricted_api, hook)
         assert shown(webhook, first, service) == (certificates / "tls.crt").read_bytes()
         (pod,) = helm.rendered({"manager": mine}).of("Pod")
         script, *where = pod["spec"]["containers"][0]["args"]
         schemes = [each.partition(":")[0] for each in where]
-        assert schemes == ["https", "/metrics-authority/ca.crt", "https", "/authority/ca.crt", there.namespace]
+        assert schemes == ["https", "/metrics-authority/ca.crt", "https", "/authority/ca.crt", restricted_api.namespace]
         where[:2] = [f"https://127.0.0.1:{metrics}", str(tmp_path / "metrics" / "ca.crt")]
         where[2:4] = [f"https://{service}:{webhook}", str(certificates / "ca.crt")]
         done = subprocess.run(
@@ -260,27 +272,32 @@ def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_i
         assert done.returncode == 0, done.stderr
         assert "the manager is ready" in done.stdout
         assert "the webhook refuses what is wrong" in done.stdout
-        stranger = Api(bare.kubeconfig_of_service_account(there.namespace, "default"), there.namespace)
+        stranger = Api(
+            empty_control_plane.kubeconfig_of_service_account(restricted_api.namespace, "default"),
+            restricted_api.namespace,
+        )
         schemas = {f"{hook}-{what}" for what in ("lease", "manager", "tasks")}
 
         def served() -> set[str]:
             with pytest.raises(ApiError, match="cannot create resource"):
                 stranger.create(TASK)
-            return served_by(there)
+            return served_by(restricted_api)
 
         wait_until(served, schemas.__eq__, what="each flow schema has served requests")
-        # What is about to expire is renewed, and the API server trusts both before the next one is shown.
+        # A certificate about to expire is renewed; the API server trusts both authorities before the new one is served.
         dying = issued((service,), datetime.timedelta(minutes=20))
         data = {name: base64.b64encode(content).decode() for name, content in dying.items()}
-        there.patch("Secret", f"{RELEASE}-webhook-certificates", {"data": data})
+        restricted_api.patch("Secret", f"{RELEASE}-webhook-certificates", {"data": data})
         bundle = wait_until(
-            lambda: trusted(there, hook), lambda found: found not in (first, b""), what="there is a new authority"
+            lambda: trusted(restricted_api, hook),
+            lambda found: found not in (first, b""),
+            what="there is a new authority",
         )
         assert dying["ca.crt"] in bundle
         wait_until(
             lambda: shown(webhook, first + bundle, service),
             lambda found: found == (certificates / "tls.crt").read_bytes() and shown(webhook, bundle, service) == found,
-            what="the new one is shown",
+            what="the new certificate is served",
         )
         assert manager.terminate() == 0
         assert "service account cannot" not in manager.output()
@@ -290,30 +307,32 @@ def test_the_installed_rights_suffice_for_the_manager_and_the_test_pod_reaches_i
         processes.kill_all()
 
 
-def test_the_api_server_accepts_the_test_pod_too(helm: Helm, there: Api) -> None:
-    (pod,) = helm.rendered({}, namespace=there.namespace).of("Pod")
-    created = there.create(pod)
+def test_the_api_server_accepts_the_test_pod_too(helm: Helm, restricted_api: Api) -> None:
+    (pod,) = helm.rendered({}, namespace=restricted_api.namespace).of("Pod")
+    created = restricted_api.create(pod)
     assert created["metadata"]["annotations"]["helm.sh/hook"] == "test"
     privileged = pod | {"metadata": {"name": "privileged"}}
     privileged["spec"]["securityContext"] = {}
     with pytest.raises(ApiError, match="violates PodSecurity"):
-        there.create(privileged)
+        restricted_api.create(privileged)
 
 
-def test_the_default_roles_of_people_cover_our_kinds(helm: Helm, there: Api) -> None:
-    install(helm, there, {})
+def test_the_default_user_roles_cover_waysides_kinds(helm: Helm, restricted_api: Api) -> None:
+    install(helm, restricted_api, {})
     rbac = "rbac.authorization.k8s.io"
     for role in ("view", "edit"):
         subject = {"apiGroup": rbac, "kind": "User", "name": f"with-{role}"}
         reference = {"apiGroup": rbac, "kind": "ClusterRole", "name": role}
         named = {"apiVersion": f"{rbac}/v1", "kind": "RoleBinding", "metadata": {"name": role}}
-        there.apply(named | {"roleRef": reference, "subjects": [subject]})
+        restricted_api.apply(named | {"roleRef": reference, "subjects": [subject]})
 
     def may(role: str, verb: str) -> bool:
-        about = {"group": "wayside.dev", "resource": "eventrules", "verb": verb, "namespace": there.namespace}
+        about = {"group": "wayside.dev", "resource": "eventrules", "verb": verb, "namespace": restricted_api.namespace}
         review = {"apiVersion": "authorization.k8s.io/v1", "kind": "SubjectAccessReview", "metadata": {}}
         return bool(
-            there.create(review | {"spec": {"user": f"with-{role}", "resourceAttributes": about}})["status"]["allowed"]
+            restricted_api.create(review | {"spec": {"user": f"with-{role}", "resourceAttributes": about}})["status"][
+                "allowed"
+            ]
         )
 
     wanted = {"view": ["list"], "edit": ["list", "create", "delete"]}
@@ -321,7 +340,7 @@ def test_the_default_roles_of_people_cover_our_kinds(helm: Helm, there: Api) -> 
     wait_until(
         lambda: {role: [verb for verb in verbs if may(role, verb)] for role in wanted},
         lambda found: found == wanted,
-        what="Kubernetes' own roles have ours",
+        what="the default roles aggregate Wayside's",
     )
 
 
@@ -340,7 +359,7 @@ def served_by(api: Api) -> set[str]:
         api.raw("/metrics"),
         re.MULTILINE,
     )
-    return set(found) & {each["metadata"]["name"] for each in ours(api, "FlowSchema")}
+    return set(found) & {each["metadata"]["name"] for each in release_objects(api, "FlowSchema")}
 
 
 RESOLVING = """
@@ -348,18 +367,18 @@ import socket
 _resolve = socket.getaddrinfo
 socket.getaddrinfo = lambda host, *rest, **more: _resolve("127.0.0.1", *rest, **more)
 """
-"""As the cluster's DNS leads to the Service."""
+"""In place of the cluster's DNS, which resolves the name of the Service."""
 
 
 def trusted(api: Api, hook: str) -> bytes:
-    """The authorities by which the API server judges the manager's certificate; empty while its webhooks differ."""
+    """The caBundle with which the API server verifies the manager's certificate; empty while the webhooks differ."""
     kinds = ("ValidatingWebhookConfiguration", "MutatingWebhookConfiguration")
     bundles = {each["clientConfig"]["caBundle"] for kind in kinds for each in api.get(kind, hook)["webhooks"]}
     return base64.b64decode(bundles.pop()) if len(bundles) == 1 else b""
 
 
 def shown(port: int, authorities: bytes, host: str) -> bytes:
-    """The certificate at the port for a client that trusts these authorities; empty if it is not valid for them."""
+    """The certificate that the port serves to a client that trusts these authorities; empty if they did not sign it."""
     context = ssl.create_default_context(cadata=authorities.decode())
     try:
         with (

@@ -31,7 +31,7 @@ from wayside.times import parse_seconds
 
 NORTH = instance_name("app", "north")
 SOUTH = instance_name("app", "south")
-LONG = 600  # s: of a Lease that lasts for as long as a test looks
+LONG = 600  # s: a Lease that outlasts the test
 EVERY_KIND = ("ApplicationTemplate", "ApplicationTask", "ApplicationInstance", "Deployment", "ConfigMap")
 
 
@@ -45,7 +45,7 @@ def versions(api: Api) -> dict[tuple[str, str], str]:
 
 
 def quiet(api: Api) -> dict[tuple[str, str], str]:
-    """Wait until nobody writes any more, and return the versions."""
+    """Wait until all writes have stopped; return the versions."""
     api.wait_list("Deployment", lambda found: all(map(has_pods, found)), what="the controllers are done")
     last: dict[str, Any] = {"versions": {}, "since": time.monotonic()}
 
@@ -61,13 +61,13 @@ def quiet(api: Api) -> dict[tuple[str, str], str]:
 
 
 def has_pods(raw: Object) -> bool:
-    """Whether the controllers have seen the Deployment as it is and made its pods."""
+    """Whether the controllers have observed the current Deployment and created its pods."""
     status = raw.get("status", {})
     seen = status.get("observedGeneration") == raw["metadata"]["generation"]
     return bool(seen and status.get("updatedReplicas") == raw["spec"]["replicas"])
 
 
-def there(api: Api, name: str) -> Object:
+def wait_deployment(api: Api, name: str) -> Object:
     return api.wait_for("Deployment", name, lambda _: True, what=f"Deployment {name} exists")
 
 
@@ -77,7 +77,7 @@ def test_a_manager_killed_while_serving_a_hundred_tasks_finishes_after_its_resta
     tasks = [task(f"{region}-{twin}", region=region) for region in regions for twin in ("a", "b")]
     with ThreadPoolExecutor(4) as pool:
         creating = [pool.submit(api.create, each) for each in tasks[:60]]
-        api.wait_list("Deployment", lambda found: len(found) >= 10, what="the manager is in the middle of it")
+        api.wait_list("Deployment", lambda found: len(found) >= 10, what="the manager has served some of the tasks")
         manager.kill9()
         for each in creating:
             each.result()
@@ -88,13 +88,13 @@ def test_a_manager_killed_while_serving_a_hundred_tasks_finishes_after_its_resta
         list(pool.map(lambda region: end(api, f"{region}-b"), regions[:20:2]))
     manager.start()
     wait_settled(api)
-    api.wait_list("Deployment", lambda found: len(found) == 40, what="the demanded 40 are there and no more")
+    api.wait_list("Deployment", lambda found: len(found) == 40, what="exactly the 40 demanded instances exist")
 
 
 @pytest.mark.own_control_plane
 def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process, control_plane: ControlPlane) -> None:
     api.create(template())
-    # In the end the holder's Lease lapses after 25 s; the outage takes 30, in which it cannot be renewed.
+    # The holder's Lease expires after 25 s; the outage takes 30 s, in which it cannot be renewed.
     api.create(template("held", lifecycle={"linger": "1s", "onDetectorLoss": {"policy": "Release", "after": "1s"}}))
     lease: Object = {
         "apiVersion": "coordination.k8s.io/v1",
@@ -106,19 +106,19 @@ def test_an_outage_of_the_api_server_releases_nothing(api: Api, manager: Process
     api.create(task("north"))
     api.create(task("held", of="held", holder="det"))
     held = instance_name("held", "held")
-    before = [there(api, name)["metadata"]["uid"] for name in (NORTH, held)]
-    control_plane.stop_controller_manager()  # else it starts with the API server, and the holder waits for that
+    before = [wait_deployment(api, name)["metadata"]["uid"] for name in (NORTH, held)]
+    control_plane.stop_controller_manager()  # otherwise it starts with the API server, and the holder waits for it
     short = {"leaseDurationSeconds": 24, "renewTime": "2026-01-01T00:00:10.000000Z"}
     api.patch("Lease", "wayside-det", {"spec": short})
     api.create(task("west"))
-    there(api, instance_name("app", "west"))  # by now the manager has seen that the Lease was renewed
+    wait_deployment(api, instance_name("app", "west"))  # by now the manager has seen that the Lease was renewed
     control_plane.stop_api_server()
     try:
-        time.sleep(30)  # the outage itself is what is tested
+        time.sleep(30)  # the outage is under test
     finally:
         control_plane.start_api_server()
     api.create(task("south"))
-    there(api, SOUTH)  # the manager looks again, and has looked at the Lease before the holder renews it
+    wait_deployment(api, SOUTH)  # the manager works again, and has read the Lease before the holder renews it
     renewed = {"leaseDurationSeconds": LONG, "renewTime": "2026-01-01T00:00:40.000000Z"}
     api.patch("Lease", "wayside-det", {"spec": renewed})
     control_plane.start_controller_manager()
@@ -132,14 +132,14 @@ def test_a_manually_deleted_deployment_is_recreated_and_a_manually_changed_field
 ) -> None:
     api.create(template())
     api.create(task("north"))
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     wait_settled(api)
     uid = api.get("Deployment", NORTH)["metadata"]["uid"]
     api.delete("Deployment", NORTH)
     api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="it is back")
     wait_settled(api)
     api.patch("Deployment", NORTH, {"spec": {"replicas": 5}})
-    api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is set right")
+    api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="the field is reset")
 
 
 def test_a_foreign_object_is_left_alone(api: Api, manager: Process) -> None:
@@ -148,7 +148,7 @@ def test_a_foreign_object_is_left_alone(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(task("north"))
     api.create(task("south"))
-    there(api, SOUTH)
+    wait_deployment(api, SOUTH)
     reported = api.wait_for(
         "ApplicationInstance",
         NORTH,
@@ -165,9 +165,14 @@ def test_a_foreign_object_is_left_alone(api: Api, manager: Process) -> None:
     now = api.get("Deployment", NORTH)
     assert now["metadata"]["generation"] == before["metadata"]["generation"]
     assert "ownerReferences" not in now["metadata"]
-    # The end of the demand does not touch it either, and once it is gone the manager's own takes its place.
+    # The end of the demand does not change it either; once it is deleted, the manager creates its own.
     api.delete("Deployment", NORTH)
-    api.wait_for("Deployment", NORTH, lambda raw: "ownerReferences" in raw["metadata"], what="ours is there instead")
+    api.wait_for(
+        "Deployment",
+        NORTH,
+        lambda raw: "ownerReferences" in raw["metadata"],
+        what="the manager has created its own",
+    )
     wait_settled(api)
 
 
@@ -179,7 +184,7 @@ def test_a_template_change_is_applied_to_its_instances_only(api: Api, manager: P
     api.create(task("bystander", of="other"))
     bystander = instance_name("other", "bystander")
     for name in (NORTH, SOUTH, bystander):
-        there(api, name)
+        wait_deployment(api, name)
     before = quiet(api)
     changed = template(manifests=[deployment("app:2"), config({"a": "b"})])
     api.patch("ApplicationTemplate", "app", {"spec": changed["spec"]})
@@ -188,13 +193,13 @@ def test_a_template_change_is_applied_to_its_instances_only(api: Api, manager: P
             "Deployment",
             name,
             lambda raw: raw["spec"]["template"]["spec"]["containers"][0]["image"] == "app:2",
-            what="the new image is there",
+            what="the Deployment has the new image",
         )
     wait_settled(api)
     after = quiet(api)
     for key in (("Deployment", bystander), ("ApplicationInstance", bystander), ("ApplicationTask", "bystander")):
         assert after[key] == before[key]
-    # What the template no longer has is pruned, and the Deployments stay as they are.
+    # Manifests removed from the template are pruned; the Deployments stay unchanged.
     generation = api.get("Deployment", NORTH)["metadata"]["generation"]
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:2")]}})
     api.wait_gone("ConfigMap", f"{NORTH}-config")
@@ -206,7 +211,7 @@ def test_a_template_change_is_applied_to_its_instances_only(api: Api, manager: P
 def test_a_template_that_becomes_invalid_leaves_running_objects_unchanged(api: Api, manager: Process) -> None:
     api.create(template(manifests=[deployment(), config({"a": "b"})]))
     api.create(task("north"))
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     wait_settled(api)
     before = {key: value for key, value in quiet(api).items() if key[0] in ("Deployment", "ConfigMap")}
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": [deployment("app:${parameters.version}")]}})
@@ -228,7 +233,7 @@ def test_a_template_that_becomes_invalid_leaves_running_objects_unchanged(api: A
 def test_an_instance_lingers_and_is_released_when_its_template_is_deleted(api: Api, manager: Process) -> None:
     api.create(template(linger="8s"))
     api.create(task("north"))
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     wait_settled(api)
     api.delete("ApplicationTemplate", "app")
     api.wait_for("ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="it lingers")
@@ -243,17 +248,20 @@ def test_an_instance_lingers_and_is_released_when_its_template_is_deleted(api: A
     api.wait_gone("Deployment", NORTH)
     wait_settled(api)
     api.create(template())
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     wait_settled(api)
 
 
 def test_a_linger_continues_through_a_restart(api: Api, manager: Process) -> None:
     api.create(template(linger="15s"))
     api.create(task("north"))
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     end(api, "north")
     lingering = api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="the deadline is noted"
+        "ApplicationInstance",
+        NORTH,
+        lambda raw: "releaseTime" in raw.get("status", {}),
+        what="the deadline is set",
     )
     manager.kill9()
     manager.start()
@@ -266,7 +274,7 @@ def test_a_linger_continues_through_a_restart(api: Api, manager: Process) -> Non
         return found is None
 
     wait_until(gone, bool, what="it goes")
-    assert time.time() >= parse_seconds(deadline), "and not before its time"
+    assert time.time() >= parse_seconds(deadline), "not before the end of the linger"
     wait_settled(api)
     api.wait_gone("Deployment", NORTH)
     assert not api.list("ApplicationInstance")
@@ -275,10 +283,10 @@ def test_a_linger_continues_through_a_restart(api: Api, manager: Process) -> Non
 def test_a_manually_deleted_instance_is_recreated_after_its_objects_are_gone(api: Api, manager: Process) -> None:
     api.create(template())
     api.create(task("north"))
-    uid = there(api, NORTH)["metadata"]["uid"]
+    uid = wait_deployment(api, NORTH)["metadata"]["uid"]
     wait_settled(api)
     api.delete("ApplicationInstance", NORTH)
-    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="another Deployment is there")
+    api.wait_for("Deployment", NORTH, lambda raw: raw["metadata"]["uid"] != uid, what="another Deployment exists")
     wait_settled(api)
 
 
@@ -289,20 +297,20 @@ def test_a_restart_and_a_resync_write_nothing(api: Api, processes: Processes, na
     api.create(task("north"))
     api.create(task("twin", region="north"))
     api.create(task("wrong", of="nowhere"))
-    there(api, NORTH)
+    wait_deployment(api, NORTH)
     wait_settled(api)
-    counted = "its status counts the instance"  # which follows a check in a worker process, and may come late
+    counted = "its status counts the instance"  # after a check in a worker process, so it may be late
     api.wait_for("ApplicationTemplate", "app", lambda raw: raw.get("status", {}).get("instances") == 1, what=counted)
     before = quiet(api)
     manager.restart()
     manager.wait_for_output("watching")
-    first = wait_until(lambda: resynced(port), bool, what="all was listed after the start")
+    first = wait_until(lambda: resynced(port), bool, what="everything was listed after the start")
     wait_until(lambda: resynced(port), lambda at: at > first + 2, what="and twice again")
     assert versions(api) == before
 
 
 def resynced(port: int) -> float:
-    """When everything was last listed, in seconds since 1970; 0: not yet, or nobody answers."""
+    """The time of the last list of everything, in seconds since 1970; 0: none yet, or no answer."""
     with suppress(OSError):
         return scraped(port)["resync_time_seconds",]
     return 0.0
@@ -314,8 +322,8 @@ def test_a_namespace_being_deleted_is_left_without_errors(api: Api, manager: Pro
         api.create(task(f"r{index}"))
     api.wait_list("Deployment", lambda found: len(found) == 5, what="all is there")
     api.delete("Namespace", namespace)
-    api.wait_list("ApplicationTask", lambda found: not found, what="the tasks are gone")
-    api.wait_list("Deployment", lambda found: not found, what="the Deployments are gone")
+    api.wait_list("ApplicationTask", lambda found: not found, what="the tasks are deleted")
+    api.wait_list("Deployment", lambda found: not found, what="the Deployments are deleted")
     assert manager.terminate() == 0
     assert "Traceback" not in manager.output()
     assert "WARNING" not in manager.output()
@@ -325,7 +333,7 @@ def test_a_namespace_being_deleted_is_left_without_errors(api: Api, manager: Pro
 def test_a_cluster_that_drops_selectable_fields_is_rejected_at_the_start(
     api: Api, processes: Processes, namespace: str
 ) -> None:
-    """As Kubernetes 1.30 drops them; an instance would never be released there."""
+    """Kubernetes 1.30 drops them, so an instance would never be released."""
     kind, name = "CustomResourceDefinition", "applicationtasks.wayside.dev"
     versions_with = api.get(kind, name)["spec"]["versions"]
     versions_without = [

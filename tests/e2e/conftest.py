@@ -1,7 +1,7 @@
-"""The fixtures of the tests on a real node: one node, one namespace a test, one test at a time.
+"""The fixtures of the tests on a real node: one node, one namespace for each test, one test at a time.
 
-Every test in this folder has the marker `e2e`. They are skipped where the machine does not let us have a node: where
-the tests do not run as root, or in a container without privileges. Elsewhere, what cannot be had is a failure.
+Every test in this folder has the marker `e2e`. They are skipped where the machine cannot run a node: where
+the tests do not run as root, or in a container without privileges. Elsewhere, a missing dependency is a failure.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def pods_text(node: Node, namespace: str) -> str:
     kubectl = partial(node.plane.kubectl, "--namespace", namespace)
     reported = [kubectl("get", "pods,deployments", "-o", "wide"), kubectl("get", "events")]
     for pod in node.api(namespace).list("Pod"):
-        with suppress(RuntimeError):  # it may have no container yet
+        with suppress(RuntimeError):  # a pod may have no container yet
             reported.append(f"--- {pod['metadata']['name']}\n{kubectl('logs', pod['metadata']['name'], '--tail=30')}")
     return "\n".join(reported)
 
@@ -66,7 +66,7 @@ def node(request: pytest.FixtureRequest) -> Iterator[Node]:
     """A running cluster of one node with Wayside's CRDs, the same for all tests of the session."""
     capture = request.config.pluginmanager.getplugin("capturemanager")
     assert capture is not None
-    with capture.global_and_fixture_disabled():  # the first build takes minutes, which nobody should wait blindly
+    with capture.global_and_fixture_disabled():  # the first build takes minutes: its progress is shown
         binaries, programs = ensure_binaries(), ensure_programs()
     with Node(binaries, programs, CRDS) as running:
         yield running
@@ -74,7 +74,7 @@ def node(request: pytest.FixtureRequest) -> Iterator[Node]:
 
 @pytest.fixture(scope="session")
 def image(node: Node, request: pytest.FixtureRequest) -> str:
-    """The name of the image of the project as it is now, on the node."""
+    """The name of the image built from the current tree, on the node."""
     capture = request.config.pluginmanager.getplugin("capturemanager")
     assert capture is not None
     with tempfile.TemporaryDirectory(prefix="wayside-image-") as folder:
@@ -99,7 +99,7 @@ def api(node: Node, namespace: str) -> Api:
 
 @pytest.fixture
 def helm(node: Node, namespace: str, tmp_path: Path) -> Iterator[Helm]:
-    """A helm for the node; a release of the test's that is left is uninstalled."""
+    """Helm for the node; a release that the test leaves installed is uninstalled afterwards."""
     made = Helm(ensure_tools().helm, tmp_path / "home", node.plane.kubeconfig)
     yield made
     made("uninstall", RELEASE, "--namespace", namespace, "--ignore-not-found")

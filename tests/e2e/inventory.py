@@ -9,11 +9,11 @@ Found = tuple[str, str, str]  # kind, namespace, name
 
 _TEMPLATE = '{range .items[*]}{.kind}{" "}{.metadata.namespace}{"/"}{.metadata.name}{"\\n"}{end}'
 _NOT_COUNTED = {"APIService", "Event"}
-"""What the API server makes and removes by itself for each group of CRDs; records of the past, which expire."""
+"""The API server creates and removes an APIService for each API group of CRDs by itself; Events expire."""
 
 
 def inventory(node: Node) -> set[Found]:
-    """All objects of all kinds that can be listed, in all namespaces; where a kind goes meanwhile, it looks again."""
+    """All objects of all listable kinds in all namespaces; lists again if a kind is removed meanwhile."""
     return wait_until(lambda: _listed(node), bool, what="all kinds can be listed", transient=(RuntimeError,))
 
 
@@ -32,11 +32,11 @@ def _listed(node: Node) -> set[Found]:
 
 
 def wait_left(node: Node, before: set[Found], kinds: set[str], timeout: float) -> set[Found]:
-    """Wait until nothing is new since `before` but objects of `kinds`; return those. Raises TimeoutError with all."""
+    """Wait until all objects that are not in `before` are of `kinds`; return them. Raises TimeoutError with all."""
     return wait_until(
         lambda: _listed(node) - before,
         lambda new: {kind for kind, _, _ in new} <= kinds,
         timeout=timeout,
-        what=f"nothing new is left but {', '.join(sorted(kinds)) or 'nothing'}",
-        transient=(RuntimeError,),  # a kind went between the question which there are and that for its objects
+        what=f"the kinds of the new objects that remain are at most: {', '.join(sorted(kinds)) or 'none'}",
+        transient=(RuntimeError,),  # a kind was removed between the discovery and the list
     )

@@ -1,4 +1,4 @@
-"""The pairs of `tests.cluster.chain` on a real node: both programs are pods, and so is what they deploy."""
+"""The pairs of `tests.cluster.chain` on a real node: both programs and the applications run in pods."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PairsOnNode(PairsNamespace):
 
         Args:
             after: how long demands outlive the detector's Lease.
-            spec: more of the Detector's.
+            spec: more fields of the Detector's spec.
         """
         self.apply(self.runnable(template(after=after)), rule())
         self.apply(detector(f"tcp/0.0.0.0:{ZENOH_PORT}", mode="Standalone", **spec))
@@ -52,7 +52,7 @@ class PairsOnNode(PairsNamespace):
         self.wait_condition("Detector", HOLDER, "Running", "True")
 
     def runnable(self, made: Object) -> Object:
-        """The template, its container one that runs until it is stopped."""
+        """The template, with a container that runs until it is stopped."""
         for manifest in made["spec"]["manifests"]:
             pod = manifest["spec"]["template"]["spec"]
             (container,) = pod["containers"]
@@ -65,7 +65,7 @@ class PairsOnNode(PairsNamespace):
         return self.api.list("Pod", labels=f"pair={'-'.join(pair)}")
 
     def wait_running(self, pair: Pair, *, restarts: int = 0) -> Object:
-        """Wait until the pair's application is one pod, ready, whose container was restarted this number of times;
+        """Wait until the pair's application is one ready pod whose container was restarted this number of times;
         return it."""
         what = f"one pod of {pair} is ready after {restarts} restarts"
 
@@ -86,7 +86,7 @@ class PairsOnNode(PairsNamespace):
         return [pod for labels in (MANAGER, DETECTOR) for pod in self.api.list("Pod", labels=labels)]
 
     def wait_programs(self, *, restarts: int = 0) -> None:
-        """Wait until each program is one pod, ready, whose container was restarted this number of times."""
+        """Wait until each program is one ready pod whose container was restarted this number of times."""
 
         def holds(pods: Objects) -> bool:
             return len(pods) == 2 and all(is_ready(pod) and restarts_of(pod) == restarts for pod in pods)
@@ -104,8 +104,8 @@ class PairsOnNode(PairsNamespace):
     def wait_metrics(
         self, holds: Callable[[Mapping[str, float]], bool], what: str, labels: str = DETECTOR
     ) -> Mapping[str, float]:
-        """Wait until the metrics are so."""
-        transient = (ApiError, Unreachable, ValueError)  # the pod may be on its way
+        """Wait until `holds` is true for the metrics."""
+        transient = (ApiError, Unreachable, ValueError)  # the pod may not be running yet
         return wait_until(lambda: self.metrics(labels), holds, timeout=NODE_PATIENCE, what=what, transient=transient)
 
     def vehicles(self) -> Vehicles:
@@ -155,11 +155,11 @@ class PublishedEvents:
 
 
 def is_ready(pod: Object) -> bool:
-    """Whether the pod is ready, and not ending."""
+    """Whether the pod is ready and not being deleted."""
     conditions = {each["type"]: each["status"] for each in pod["status"].get("conditions", [])}
     return conditions.get("Ready") == "True" and "deletionTimestamp" not in pod["metadata"]
 
 
 def restarts_of(pod: Object) -> int:
-    """The number of restarts of its containers."""
+    """The number of restarts of the pod's containers."""
     return sum(status["restartCount"] for status in pod["status"].get("containerStatuses", []))

@@ -14,7 +14,7 @@ _NAMESPACES = ("--mount", "--net", "--pid", "--propagation=private", "--fork", "
 
 @cache
 def why_no_node() -> str | None:
-    """Why there can be no node here, with the remedy; None where there can."""
+    """The reason why no node can run here, with the remedy; None if one can."""
     if os.geteuid() != 0:
         return "a real node needs root: run `make e2e` as root"
     try:

@@ -1,7 +1,7 @@
 """The programs of a node: Debian's where it packages them, the others built from pinned source.
 
-`python -m tests.e2e.programs` installs and builds what is missing. The control plane's are not among them: they have
-their own cache (`tests.cluster.binaries`), which the tests without a node fill.
+`python -m tests.e2e.programs` installs and builds the missing programs, except those of the control plane: they
+have a separate cache (`tests.cluster.binaries`), which the tests without a node fill.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ PACKAGES = {
 }
 """The Debian package of each program."""
 PATIENTLY = ("-o", "Acquire::Retries=5", "-o", "DPkg::Lock::Timeout=600")
-"""A mirror that stumbles, or somebody else who installs something just now, is no reason to fail."""
+"""apt-get retries when a mirror fails, and waits while another process holds its lock."""
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -62,7 +62,7 @@ class ProgramsUnavailableError(Exception):
 
 @dataclass(frozen=True)
 class Programs:
-    """Where the programs are: folders of those that we build; Debian's are on the PATH of the system."""
+    """The folders of the programs that are built here; those from Debian are on the system's PATH."""
 
     containers: Path
     node: Path
@@ -71,15 +71,15 @@ class Programs:
 
     @property
     def path(self) -> str:
-        """A PATH with all of them."""
+        """A PATH with all programs of the node."""
         return f"{self.containers}:{self.node}:{SYSTEM_PATH}"
 
 
 def ensure_programs(console: Console | None = None) -> Programs:
-    """Find, install and build what is missing.
+    """Find all programs; install and build the missing ones.
 
     Raises:
-        ProgramsUnavailableError: something cannot be had, with the remedy.
+        ProgramsUnavailableError: a program is missing and unavailable; with the remedy.
     """
     console = console or Console(stderr=True)
     install(console)
@@ -91,7 +91,7 @@ def ensure_programs(console: Console | None = None) -> Programs:
 
 
 def install(console: Console) -> None:
-    """Install those of Debian's packages that are missing. Raises ProgramsUnavailableError."""
+    """Install the missing Debian packages. Raises ProgramsUnavailableError."""
     with apt_lock():
         missing = sorted(package for name, package in PACKAGES.items() if shutil.which(name, path=SYSTEM_PATH) is None)
         if missing:
@@ -116,8 +116,8 @@ def _install(missing: Sequence[str], console: Console) -> None:
 
 
 def main() -> int:
-    """Provide what a node runs beside its control plane; nothing where there can be no node."""
-    from tests.e2e.privileges import why_no_node  # which looks at the node's enclosure, and that is above us
+    """Provide the programs that a node runs beside its control plane; none where no node can run."""
+    from tests.e2e.privileges import why_no_node  # circular: its imports import this module
 
     if (reason := why_no_node()) is not None:
         print(f"nothing is built for the tests on a real node, which are skipped: {reason}")

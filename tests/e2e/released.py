@@ -23,7 +23,7 @@ zenoh.init_log_from_env_or("error")
 session = zenoh.open(zenoh.Config.from_file(sys.argv[2]))
 threading.Event().wait()
 """
-"""A router, as the image of Zenoh's own is out of reach here: the same library, the same configuration."""
+"""A router in place of the official Zenoh image, which cannot be pulled here: same library, same configuration."""
 CLIENTS = [
     {"name": "vehicles", "commonNames": ["car1"], "publish": ["vehicles/{commonName}/**"]},
     {"name": "detectors", "commonNames": ["town"], "subscribe": ["vehicles/**"], "publish": ["wayside/**"]},
@@ -31,13 +31,13 @@ CLIENTS = [
 
 
 def image_values(image: str) -> dict[str, Any]:
-    """The value `image` for an image that the node has."""
+    """The chart value `image` for an image that is already on the node."""
     repository, _, tag = image.rpartition(":")
     return {"repository": repository, "tag": tag, "pullPolicy": "Never"}
 
 
 def values(namespace: str, image: str, detector: Mapping[str, Any]) -> dict[str, Any]:
-    """The manager of this namespace, the router, and a Detector `town` that connects to it; `detector`: its spec."""
+    """A manager of this namespace, the router, and a Detector `town` with the spec `detector` that connects to it."""
     reached = {"mode": "client", "connect": [f"tls/{ROUTER}:7447"], "tlsSecretName": "town-tls"}
     return {
         "image": image_values(image),
@@ -55,7 +55,7 @@ def values(namespace: str, image: str, detector: Mapping[str, Any]) -> dict[str,
 
 
 def apply_certificates(api: Api, authority: Authority) -> None:
-    """The Secrets that the values name."""
+    """Apply the Secrets that the values refer to."""
     for who, host in (("router", ROUTER), ("town", "town")):
         certificate, key = authority.sign(who, host)
         files = {"ca.crt": authority.ca, "tls.crt": certificate, "tls.key": key}
@@ -70,14 +70,14 @@ def wait_installed(api: Api) -> None:
 
 
 def available(found: dict[str, Any]) -> bool:
-    """Whether all pods of a Deployment are ready, and of its present spec."""
+    """Whether all pods of a Deployment are ready and match its current spec."""
     status, wanted = found.get("status", {}), found["spec"]["replicas"]
     seen = status.get("observedGeneration") == found["metadata"]["generation"]
     return bool(seen and status.get("updatedReplicas") == status.get("availableReplicas") == wanted)
 
 
-def outside(node: Node, api: Api) -> str:
-    """Where the machine reaches the router."""
+def router_endpoint(node: Node, api: Api) -> str:
+    """The endpoint at which the machine reaches the router."""
     port = api.get("Service", ROUTER)["spec"]["ports"][0]["nodePort"]
     return f"tls/{node.address}:{port}"
 
@@ -85,7 +85,7 @@ def outside(node: Node, api: Api) -> str:
 def vehicle(
     endpoint: str, authority: Path, certificate: tuple[Path, Path] | None, *, patience: float = NODE_PATIENCE
 ) -> zenoh.Session:
-    """A session from outside. Raises zenoh.ZError where it is not let in within `patience` seconds."""
+    """A vehicle's session from outside. Raises zenoh.ZError if the router rejects it for `patience` seconds."""
     tls: dict[str, Any] = {"root_ca_certificate": str(authority), "verify_name_on_connect": False}
     if certificate is not None:
         tls |= {"connect_certificate": str(certificate[0]), "connect_private_key": str(certificate[1])}

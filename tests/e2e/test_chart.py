@@ -1,4 +1,4 @@
-"""The chart on a node that knows nothing of Wayside: what helm installs serves vehicles, and leaves nothing behind."""
+"""The chart on a node without Wayside: the installed release serves vehicles, and its uninstall leaves no objects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.e2e.released import (
     ROUTER,
     apply_certificates,
     available,
-    outside,
+    router_endpoint,
     values,
     vehicle,
     wait_installed,
@@ -40,7 +40,7 @@ from cooperative_recording.vehicles import LIDAR_VEHICLES
 
 DETECTOR_SPEC = yaml.safe_load((EXAMPLE / "detector.yaml").read_text(encoding="utf-8"))["spec"]
 AS_THE_GUIDE = ("--wait", "--timeout", "5m")
-"""So that all of the API server knows the kinds before a hook makes the Detectors of the values."""
+"""`--wait` lets the API server serve the CRDs before a hook creates the Detectors of the values."""
 WRONG: Object = {
     "apiVersion": "wayside.dev/v1alpha1",
     "kind": "ApplicationTemplate",
@@ -50,28 +50,28 @@ WRONG: Object = {
 
 
 @pytest.fixture
-def bare(node: Node, api: Api) -> Iterator[Api]:
-    """The test's namespace, under the restricted Pod Security Standard, on a node that does not know our kinds."""
+def api_without_crds(node: Node, api: Api) -> Iterator[Api]:
+    """The test's namespace, under the restricted Pod Security Standard, on a node without Wayside's CRDs."""
     remove_crds(api, CRD_NAMES)
     api.patch(
         "Namespace", api.namespace, {"metadata": {"labels": {"pod-security.kubernetes.io/enforce": "restricted"}}}
     )
-    api.wait_for("ConfigMap", "kube-root-ca.crt", lambda _: True, what="the namespace has all that each one gets")
+    api.wait_for("ConfigMap", "kube-root-ca.crt", lambda _: True, what="the namespace has the ConfigMap of the root CA")
     yield node.api(api.namespace)
     remove_crds(api, CRD_NAMES)
     apply_crds(api)
 
 
-def of(api: Api, name: str) -> Objects:
-    """The pods of a Deployment of the release, or of the detector."""
+def release_pods(api: Api, name: str) -> Objects:
+    """The pods of the detector, or of another Deployment of the release."""
     label = f"wayside.dev/runs={name.removeprefix('detector-')}" if name == DETECTOR else (
         f"app.kubernetes.io/component={name.removeprefix(f'{RELEASE}-')}"
     )  # fmt: skip
     return api.list("Pod", labels=label)
 
 
-def lives(pods: Objects) -> list[tuple[str, int]]:
-    """Of each pod, which one it is, and how often its containers were restarted."""
+def uids_and_restarts(pods: Objects) -> list[tuple[str, int]]:
+    """The uid of each pod and the number of restarts of its containers."""
     return [
         (pod["metadata"]["uid"], sum(each["restartCount"] for each in pod["status"].get("containerStatuses", [])))
         for pod in pods
@@ -79,9 +79,9 @@ def lives(pods: Objects) -> list[tuple[str, int]]:
 
 
 def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing_is_left(
-    node: Node, bare: Api, image: str, helm: Helm, tmp_path: Path
+    node: Node, api_without_crds: Api, image: str, helm: Helm, tmp_path: Path
 ) -> None:
-    api, authority = bare, Authority(tmp_path)
+    api, authority = api_without_crds, Authority(tmp_path)
     before = inventory(node)
     apply_certificates(api, authority)
     given = copy.deepcopy(values(api.namespace, image, DETECTOR_SPEC))
@@ -98,20 +98,19 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
     example = [each for each in example_documents(image, ["python3", "-c", REPORT]) if each["kind"] != "Detector"]
     for document in example:
         api.apply(document)
-    one, other = (
-        ParkedVehicles(vehicle(outside(node, api), authority.ca, authority.sign(name))) for name in (first, second)
-    )
-    with one, other:  # each may send its own data only
+    endpoint = router_endpoint(node, api)
+    one, other = (ParkedVehicles(vehicle(endpoint, authority.ca, authority.sign(name))) for name in (first, second))
+    with one, other:  # each certificate permits only the vehicle's own keys
         one.put(first, 0)
         other.put(second, 100)
         (recorder,) = wait_pods(api, "scene-recorder", ready, "the recorder of the two runs")
         (fusion,) = wait_pods(api, "scene-fusion", ready, "the fusion of their scene runs")
         assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in logged(node, recorder)
-        reported = wait_until(lambda: logged(node, fusion), lambda text: first in text, what="it has its configuration")
+        reported = wait_until(lambda: logged(node, fusion), lambda text: first in text, what="it has the sources")
         assert reported.count(first) == 1, "once"
 
-        running = lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])
-        serving = lives([*of(api, DETECTOR), *of(api, ROUTER)])
+        running = uids_and_restarts([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")])
+        serving = uids_and_restarts([*release_pods(api, DETECTOR), *release_pods(api, ROUTER)])
         changed = copy.deepcopy(given)
         changed["manager"] |= {"replicas": 2, "podAnnotations": {"example.com/changed": "yes"}}
         helm("upgrade", RELEASE, str(CHART), *where, values=changed)
@@ -122,13 +121,13 @@ def test_the_example_from_nothing_by_mutual_tls_through_an_upgrade_until_nothing
             timeout=NODE_PATIENCE,
             what="two managers of the new version are ready",
         )
-        assert lives([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")]) == running
-        assert lives([*of(api, DETECTOR), *of(api, ROUTER)]) == serving
+        assert uids_and_restarts([*applications(api, "scene-recorder"), *applications(api, "scene-fusion")]) == running
+        assert uids_and_restarts([*release_pods(api, DETECTOR), *release_pods(api, ROUTER)]) == serving
 
-        other.put(second, 1000)  # which the new manager acts on
-        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is gone")
-        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is gone")
-    api.wait_list("ApplicationTask", lambda found: not found, timeout=NODE_PATIENCE, what="the tasks are over and gone")
+        other.put(second, 1000)  # the new manager acts on it
+        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is removed")
+        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is removed")
+    api.wait_list("ApplicationTask", lambda found: not found, timeout=NODE_PATIENCE, what="the tasks are deleted")
 
     for document in example:
         api.delete(document["kind"], document["metadata"]["name"])
@@ -143,23 +142,24 @@ def logged(node: Node, pod: Object) -> str:
     """The log of the pod, once it is not empty."""
     metadata = pod["metadata"]
     log = ("--namespace", metadata["namespace"], "logs", metadata["name"])
-    return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {metadata['name']} has written")
+    return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {metadata['name']} has written to its log")
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_a_release_that_was_never_upgraded_leaves_no_detector_behind(
-    node: Node, bare: Api, image: str, helm: Helm, tmp_path: Path, keep: bool
+    node: Node, api_without_crds: Api, image: str, helm: Helm, tmp_path: Path, keep: bool
 ) -> None:
+    api = api_without_crds
     before = inventory(node)
-    apply_certificates(bare, Authority(tmp_path))
-    given = values(bare.namespace, image, DETECTOR_SPEC) | {"crds": {"keep": keep}}
-    helm("install", RELEASE, str(CHART), "--namespace", bare.namespace, *AS_THE_GUIDE, values=given)
-    wait_installed(bare)
+    apply_certificates(api, Authority(tmp_path))
+    given = values(api.namespace, image, DETECTOR_SPEC) | {"crds": {"keep": keep}}
+    helm("install", RELEASE, str(CHART), "--namespace", api.namespace, *AS_THE_GUIDE, values=given)
+    wait_installed(api)
     if not keep:
-        wait_garbage_collected(bare)
-    helm("uninstall", RELEASE, "--namespace", bare.namespace)
+        wait_garbage_collected(api)
+    helm("uninstall", RELEASE, "--namespace", api.namespace)
     for name in ("router-tls", "town-tls"):
-        bare.delete("Secret", name)
+        api.delete("Secret", name)
     for name in () if keep else CRD_NAMES:
-        wait_crd_gone(bare, name)
+        wait_crd_gone(api, name)
     wait_left(node, before, {"CustomResourceDefinition"} if keep else set(), NODE_PATIENCE)

@@ -1,4 +1,4 @@
-"""The cooperative-recording example on a real node: both programs are pods, and so is what they deploy."""
+"""The cooperative-recording example on a real node: both programs and the applications run in pods."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ while True:
         last = text
     time.sleep(0.1)
 """
-"""What each application does: it prints how it was started, and its configuration at each change."""
+"""The program of each application: it prints its arguments, and its configuration at each change."""
 
 
 def applications(api: Api, name: str) -> Objects:
@@ -64,18 +64,18 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
             return wait_until(lambda: node.plane.kubectl(*log), bool, what=f"pod {pod} has written")
 
         def configurations() -> list[list[str]]:
-            """The sources that the fusion received, one after the other."""
+            """The sources in each configuration that the fusion received, in order."""
             documents = yaml.safe_load_all(logged(fusion["metadata"]["name"]))
             return [yaml.safe_load(str(each["sources"])) for each in documents if each]
 
         reported = logged(recorder["metadata"]["name"])
         assert f"--key=vehicles/{first}/** --key=vehicles/{second}/** --output=/recording" in reported
-        # What it writes comes in parts: the heading, then the configuration.
+        # The log may end between a heading and its configuration.
         written = wait_until(
             configurations,
             bool,
             timeout=NODE_PATIENCE,
-            what="the fusion receives them",
+            what="the fusion receives the sources",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )
         assert written == [sorted([first, second])]
@@ -93,7 +93,7 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
             configurations,
             lambda found: found[-1] == everybody,
             timeout=NODE_PATIENCE,
-            what="the fusion receives all",
+            what="the fusion receives all sources",
             transient=(yaml.YAMLError, TypeError, KeyError),
         )
         (same,) = applications(api, "scene-fusion")
@@ -103,8 +103,8 @@ def test_applications_really_run_while_vehicles_are_close_follow_who_joins_and_a
         vehicles.put(third, 2000)
         vehicles.put(second, 1000)
 
-        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is gone")
-        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is gone")
+        wait_pods(api, "scene-recorder", lambda pods: not pods, "the recorder is removed")
+        wait_pods(api, "scene-fusion", lambda pods: not pods, "the fusion is removed")
     pods = [
         pod for each in ("app=application-manager", "wayside.dev/runs=town") for pod in api.list("Pod", labels=each)
     ]

@@ -44,9 +44,9 @@ def test_a_run_that_is_killed_leaves_nothing_but_cgroups_and_the_next_removes_th
     os.kill(run.pid, signal.SIGKILL)
     run.wait()
 
-    wait_until(lambda: f"we2e{run.pid}" in interfaces(), lambda there: not there, what="its interface is gone")
-    wait_until(lambda: Path(f"/proc/{child}").exists(), lambda there: not there, what="its processes are gone")
-    wait_until(lambda: Path(folder).exists(), lambda there: not there, what="its folder is gone")
+    wait_until(lambda: f"we2e{run.pid}" in interfaces(), lambda there: not there, what="its interface is removed")
+    wait_until(lambda: Path(f"/proc/{child}").exists(), lambda there: not there, what="its processes have ended")
+    wait_until(lambda: Path(folder).exists(), lambda there: not there, what="its folder is removed")
     remove_stale_cgroups()
     assert cgroups(f"{run.pid}-*") == []
 

@@ -41,7 +41,7 @@ def test_a_deployment_of_our_image_runs_and_logs_and_exec_work(node: Node, api: 
     pod = wait_available(api, "app")["metadata"]["name"]
 
     logged = wait_until(
-        lambda: node.plane.kubectl("--namespace", api.namespace, "logs", pod), bool, what="the pod has written"
+        lambda: node.plane.kubectl("--namespace", api.namespace, "logs", pod), bool, what="the pod has logged"
     )
     assert logged == "it runs\n"
     for program in ("detector", "application-manager"):
@@ -123,7 +123,7 @@ def test_the_api_server_reaches_a_webhook_on_a_pod(node: Node, api: Api, image: 
                 api.create(requested)
             except ApiError as error:
                 return error.message
-            api.delete("ConfigMap", "requested")  # the API server has not read the webhook's configuration yet
+            api.delete("ConfigMap", "requested")  # the API server may not have loaded the webhook configuration yet
             return ""
 
         output = wait_until(refusal, lambda output: "the pod refuses" in output, what="the webhook is called")
@@ -150,11 +150,11 @@ def test_pods_outlive_kubelet_and_containerd(node: Node, api: Api, image: str) -
 
 
 def test_what_the_programs_write_is_inside_and_not_on_the_machine(node: Node, api: Api, image: str) -> None:
-    """The machine may have such folders of its own: other clusters, a Docker daemon."""
+    """The machine may have folders of the same names, from other clusters or a Docker daemon."""
     api.apply(deployment("app", image, ("python3", "-c", "import time; time.sleep(10**6)")))
     wait_available(api, "app")
     for folder in ("/var/lib/cni", "/var/lib/kubelet", "/var/log/containers", "/run/containerd"):
-        look = ("find", folder, "-maxdepth", "3", "-ignore_readdir_race")  # below are the roots of containers
+        look = ("find", folder, "-maxdepth", "3", "-ignore_readdir_race")  # container roots are deeper
         inside = node.enclosure.run(*look, path=SYSTEM_PATH).splitlines()
         outside = subprocess.run(look, capture_output=True, text=True, check=False).stdout.splitlines()
-        assert {*inside} - {*outside}, f"nothing of {folder} is the node's alone"
+        assert {*inside} - {*outside}, f"no entry of {folder} is the node's alone"

@@ -99,7 +99,7 @@ def test_without_the_api_server_applications_continue_and_what_was_seen_is_repor
                 heard.wait(pair, "started")
             vehicles.place(TRAMS, FAR)
             heard.wait(TRAMS, "started", "Until")
-            time.sleep(max(began + OUTAGE - time.monotonic(), 0.0))  # what is tested is that it lasts
+            time.sleep(max(began + OUTAGE - time.monotonic(), 0.0))  # the outage must outlast the Lease
             back = time.time_ns()
 
         town.wait_running(BUSES)

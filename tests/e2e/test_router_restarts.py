@@ -45,14 +45,14 @@ ADVANCED_STREAM = {"name": "heading", "key": "vehicles/${client:*}/heading", "en
 POSE_STREAM = {"name": "pose", "key": "vehicles/${client:*}/pose", "encoding": "json", "staleAfter": "2s"}
 FLOAT = b"\x00\x01\x00\x00" + bytes(8)
 LOST = 20
-"""Minimum number of samples of each stream that are published without a router."""
+"""The minimum number of samples of each stream to publish without a router."""
 
 
 class NumberingVehicle:
-    """A vehicle with numbered samples, ten a second of each stream.
+    """A vehicle that publishes ten numbered samples a second on each stream.
 
     Attributes:
-        sent: how many of each stream.
+        sent: the number of samples published on each stream.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -69,7 +69,7 @@ class NumberingVehicle:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        """Publish, from when the detector is subscribed to both: so the first ones arrive."""
+        """Publish once the detector has subscribed to both streams, so that the first samples arrive."""
         wait_until(
             lambda: [each.matching_status.matching for each in self._seen],
             all,
@@ -79,12 +79,12 @@ class NumberingVehicle:
         self._thread.start()
 
     def wait_sent(self, more: int) -> None:
-        """Wait until this number more were sent of each stream."""
+        """Wait until `more` further samples of each stream are published."""
         goal = self.sent + more
         wait_until(lambda: self.sent, lambda sent: sent >= goal, timeout=NODE_PATIENCE, what=f"{goal} were sent")
 
     def stop(self) -> int:
-        """Publish no more; returns how many were sent of each stream."""
+        """Stop publishing; return the number of samples published on each stream."""
         self._ended.set()
         self._thread.join()
         return self.sent
@@ -110,8 +110,8 @@ def numbered(endpoint: str) -> Iterator[NumberingVehicle]:
         vehicle.close()
 
 
-def of(metrics: Mapping[str, float], name: str, **labels: str) -> float:
-    """The sum of the metric where the labels are these."""
+def metric_sum(metrics: Mapping[str, float], name: str, **labels: str) -> float:
+    """The sum of the metric's series that have these labels."""
     wanted = [f'{label}="{value}"' for label, value in labels.items()]
     return sum(
         value
@@ -121,16 +121,16 @@ def of(metrics: Mapping[str, float], name: str, **labels: str) -> float:
 
 
 def arrived(metrics: Mapping[str, float], stream: str) -> int:
-    return int(of(metrics, "stream_samples_total", stream=stream))
+    return int(metric_sum(metrics, "stream_samples_total", stream=stream))
 
 
 def missed(metrics: Mapping[str, float], stream: str) -> int:
-    return int(of(metrics, "losses_total", stream=stream, cause="missed"))
+    return int(metric_sum(metrics, "losses_total", stream=stream, cause="missed"))
 
 
 @pytest.fixture
 def router(api: Api, image: str) -> str:
-    """The name of the Deployment and the Service of a router, which is there."""
+    """Run a router; return the name of its Deployment and Service."""
     pod: dict[str, Any] = {"port": ZENOH_PORT}
     api.apply(deployment("router", image, ["python3", "-c", ROUTER], **pod))
     api.apply(service("router", ZENOH_PORT, type="NodePort"))
@@ -166,7 +166,7 @@ def test_detector_and_vehicles_find_a_restarted_router_and_losses_are_counted(
         flows("at first")
 
         (first,) = running_pods(api, router)
-        with suppress(RuntimeError):  # what runs in the container ends with its first process
+        with suppress(RuntimeError):  # the container ends with its first process
             node.plane.kubectl("-n", api.namespace, "exec", first["metadata"]["name"], "--", "python3", "-c", CRASH)
         api.wait_for("Pod", first["metadata"]["name"], lambda raw: restarts_of(raw) == 1, what="the router crashed")
         wait_available(api, router)
@@ -174,7 +174,7 @@ def test_detector_and_vehicles_find_a_restarted_router_and_losses_are_counted(
         vehicles.place(CARS, BETWEEN)
 
         api.patch("Deployment", router, {"spec": {"replicas": 0}})
-        api.wait_list("Pod", lambda pods: not pods, labels=f"app={router}", what="the router is gone")
+        api.wait_list("Pod", lambda pods: not pods, labels=f"app={router}", what="the router is removed")
         vehicles.place(VANS, NEAR)
         vehicle.wait_sent(LOST)
         api.patch("Deployment", router, {"spec": {"replicas": 1}})

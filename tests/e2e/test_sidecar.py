@@ -30,7 +30,7 @@ with zenoh.open(config) as session:
         session.put("vehicles/car1/speed", json.dumps({{"value": 50}}))
         time.sleep(0.1)
 """
-"""What the pod's own program does: it publishes how fast the car is, over localhost."""
+"""The pod's own program: it publishes the car's speed over localhost."""
 WAIT = "import time; time.sleep(10**6)"
 
 
@@ -39,7 +39,7 @@ def resources(image: str) -> list[Object]:
     zenoh = {"mode": "peer", "listen": [f"tcp/127.0.0.1:{ZENOH_PORT}"], "scouting": False}
     application = deployment("${instance.name}", image, ["python3", "-c", WAIT])
     return [
-        ours(
+        wayside_object(
             "Detector",
             DETECTOR,
             mode="Sidecar",
@@ -48,7 +48,7 @@ def resources(image: str) -> list[Object]:
             streams=[stream],
             clientTimeout="60s",
         ),
-        ours(
+        wayside_object(
             "EventRule",
             "fast",
             signals=[{"name": "speed", "stream": "speed", "value": "msg.value"}],
@@ -56,7 +56,7 @@ def resources(image: str) -> list[Object]:
             when="speed > 30",
             actions=[{"name": "deploy", "deploy": {"templateName": "app"}}],
         ),
-        ours(
+        wayside_object(
             "ApplicationTemplate",
             "app",
             lifecycle={"linger": "1s", "onDetectorLoss": {"policy": "Release", "after": "1s"}},
@@ -66,12 +66,12 @@ def resources(image: str) -> list[Object]:
     ]
 
 
-def ours(kind: str, name: str, **spec: Any) -> Object:
+def wayside_object(kind: str, name: str, **spec: Any) -> Object:
     return {"apiVersion": "wayside.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec}
 
 
 def pod_spec(image: str, program: str) -> Object:
-    """Under the restricted standard, by the account `vehicle`, which mounts no token."""
+    """A pod spec that meets the restricted standard, with the account `vehicle` and no mounted token."""
     main = {"name": "main", "image": image, "imagePullPolicy": "Never", "command": ["python3", "-c", program]}
     return {
         "serviceAccountName": "vehicle",
@@ -88,7 +88,7 @@ def sidecar_of(pod: Object) -> Object:
 
 @pytest.fixture
 def asking(api: Api, image: str, helm: Helm) -> None:
-    """The chart is installed as it comes, with webhooks and policy, and everything is there but pods."""
+    """The chart is installed with its default values (webhooks and policy); all objects but the pods exist."""
     given = {"image": image_values(image), "crds": {"install": False}, "manager": {"namespaces": [api.namespace]}}
     helm("install", RELEASE, str(CHART), "--namespace", api.namespace, values=given)
     api.wait_for("Deployment", MANAGER, available, timeout=NODE_PATIENCE, what="the manager is available")
@@ -108,11 +108,11 @@ def asking(api: Api, image: str, helm: Helm) -> None:
         lambda: api.apply(probe | {"spec": pod_spec(image, WAIT)}, dry_run=True)["spec"].get("initContainers"),
         bool,
         timeout=NODE_PATIENCE,
-        what="the API server calls the webhook for pods, and reaches it",
+        what="the API server calls the webhook for pods and reaches it",
     )
 
 
-def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
+def test_a_pods_detector_sees_its_data_and_its_application_is_removed_with_the_pod(
     api: Api, image: str, asking: None
 ) -> None:
     pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "car", "labels": RETRIES}}
@@ -138,7 +138,7 @@ def test_a_pods_detector_sees_its_data_and_what_it_demands_goes_with_the_pod(
     api.wait_gone("Lease", f"wayside-{holder}", timeout=NODE_PATIENCE)
     api.wait_gone("Deployment", application, timeout=NODE_PATIENCE)
     api.wait_list(
-        "Pod", lambda found: not found, labels=f"app={application}", timeout=NODE_PATIENCE, what="its pods are gone"
+        "Pod", lambda found: not found, labels=f"app={application}", timeout=NODE_PATIENCE, what="its pods are removed"
     )
 
 
@@ -156,5 +156,5 @@ def test_a_job_with_a_detector_completes(api: Api, image: str, asking: None) -> 
     )
     (pod,) = api.list("Pod", labels="job-name=nightly")
     assert pod["status"]["phase"] == "Succeeded"
-    # In good order, or before it had begun; never by force, after the whole grace period.
+    # It ends on SIGTERM, also during its start; SIGKILL would come only after the whole grace period.
     assert sidecar_of(pod)["state"]["terminated"]["exitCode"] in (0, ENDED)

@@ -1,4 +1,4 @@
-"""Both programs as pods: what the tests of the whole chain apply."""
+"""Both programs as pods, for the tests of the whole chain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.patience import NODE_PATIENCE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cooperative-recording"
 ZENOH_PORT, METRICS_PORT = 7447, 9100
-LATE = {"timeoutSeconds": 5}  # as the chart has it; the default of a second is short on a busy machine
+LATE = {"timeoutSeconds": 5}  # as in the chart; the default of a second is short on a busy machine
 RESTRICTED = {  # the Pod Security Standard of this name
     "allowPrivilegeEscalation": False,
     "capabilities": {"drop": ["ALL"]},
@@ -28,7 +28,7 @@ RESTRICTED = {  # the Pod Security Standard of this name
 
 
 def apply_manager(api: Api, image: str) -> None:
-    """The manager of this namespace, with the rights that it prints itself."""
+    """Apply a manager of this namespace, with the rights that `application-manager rbac` prints."""
     api.apply({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": {"name": "application-manager"}})
     account = f"--account={api.namespace}/application-manager"
     rbac = [
@@ -48,7 +48,7 @@ def apply_manager(api: Api, image: str) -> None:
 
 
 def run_town(api: Api, image: str) -> int:
-    """Have a manager run the example's detector; returns the port of the node where its Zenoh is."""
+    """Run the example's detector through a manager; return the node port of its Zenoh endpoint."""
     apply_manager(api, image)
     port = expose_detector(api, "town")
     wait_available(api, "application-manager")
@@ -63,13 +63,13 @@ def run_town(api: Api, image: str) -> int:
 
 
 def expose_detector(api: Api, name: str) -> int:
-    """Lead to the Zenoh of the detector of this name, which the manager runs; returns the port of the node."""
+    """Expose the Zenoh endpoint of the named detector, which the manager runs; return the node port."""
     applied = api.apply(service("detector", ZENOH_PORT, type="NodePort", selector={"wayside.dev/runs": name}))
     return int(applied["spec"]["ports"][0]["nodePort"])
 
 
 def apply_example(api: Api, image: str, command: list[str]) -> None:
-    """The cooperative-recording example, with a detector that the manager runs and that vehicles reach."""
+    """Apply the cooperative-recording example, with a detector that the manager runs and vehicles can reach."""
     for document in example_documents(image, command):
         if document["kind"] == "Detector":
             document["spec"]["mode"] = "Standalone"
@@ -78,7 +78,7 @@ def apply_example(api: Api, image: str, command: list[str]) -> None:
 
 
 def example_documents(image: str, command: list[str]) -> Iterator[Object]:
-    """The example's own files, but for the images and the namespace."""
+    """The documents of the example's files, with other images and another namespace."""
     for file in ("templates.yaml", "rules.yaml", "detector.yaml"):
         for document in yaml.safe_load_all((EXAMPLE / file).read_text(encoding="utf-8")):
             document["metadata"].pop("namespace", None)

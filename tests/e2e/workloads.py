@@ -1,4 +1,4 @@
-"""Workloads for tests: what runs in a pod is Python, since that is what our image has."""
+"""Workloads for tests: their pods run Python, which Wayside's image has."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def deployment(
     container: Mapping[str, Any] | None = None,
     **pod: Any,
 ) -> Object:
-    """Return a Deployment of one pod, ready when its port (if it has one) answers; `pod`: more of the pod's spec."""
+    """Return a Deployment of one pod, ready when its port (if any) answers; `pod`: more fields of the pod's spec."""
     labels = {"app": name}
     main: Object = {"name": "main", "image": image, "command": list(command), "imagePullPolicy": "Never"}
     if port:
@@ -50,7 +50,7 @@ def service(name: str, port: int, target: int = 0, **spec: Any) -> Object:
 
 
 def wait_available(api: Api, name: str, timeout: float = NODE_PATIENCE) -> Object:
-    """Wait until all pods of a Deployment are ready, of its present spec; return one of them."""
+    """Wait until all pods of a Deployment are ready and match its current spec; return one of them."""
 
     def holds(found: Object) -> bool:
         status, wanted = found.get("status", {}), found["spec"]["replicas"]

@@ -1,9 +1,9 @@
 """The images of the tests, made on machines that reach no image registry: Debian's packages and our wheel.
 
-The image of this project has three layers: a root from debootstrap (cached by what it is made of), the packages that
-the project depends on (cached by their pins), and the project. It has what the Dockerfile makes it have: both programs,
-an unprivileged user, no start through a shell; and all of it compiled, as a container's root cannot be written to, so
-that each start would compile again.
+The image of this project has three layers: a root from debootstrap (cached by its inputs), the packages that
+the project depends on (cached by their pins), and the project. It has the content of the Dockerfile's: both programs,
+an unprivileged user, an entrypoint without a shell. All is compiled: a container's root is read-only, so
+otherwise each start would compile again.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tests.gobuild import cache, locked
 ROOT = Path(__file__).parents[3]
 SANDBOX_IMAGE = "wayside.test/pause:1"
 WAYSIDE_IMAGE = "wayside.test/wayside:1"
-SUITE, PYTHON = "bookworm", "3.11"  # they go together: the Python of that Debian
+SUITE, PYTHON = "bookworm", "3.11"  # the Python version of this Debian suite
 MIRROR = "http://deb.debian.org/debian"
 INCLUDED = "python3,ca-certificates"
 LIBRARIES = f"usr/local/lib/python{PYTHON}/dist-packages"
 LEFT_OUT = ("usr/share/doc", "usr/share/man", "usr/share/locale", "usr/share/info", "var/cache", "var/lib/apt/lists",
             "var/log", "dev", "proc", "sys", "run", "tmp")  # fmt: skip
 KEPT_DEFINITIONS = ("__init__", "ITS")
-"""What is kept of pycrate's ASN.1 modules: ITS messages. All others, of mobile networks mostly, are 140 MB."""
+"""The ASN.1 modules of pycrate to keep: ITS messages. All others, mostly of mobile networks, are 140 MB."""
 NOBODY = "65532:65532"
 STUB = """\
 #!/usr/bin/python3
@@ -48,14 +48,14 @@ class ImageError(Exception):
 
 
 def pause_archive(program: Path, folder: Path) -> Path:
-    """Write the image of a pod's sandbox, of nothing but `program`; return the archive."""
+    """Write the image of a pod's sandbox, which contains only `program`; return the archive."""
     layer = write_layer(folder / "pause-layer.tar", [(program, "pause")])
     write_archive(archive := folder / "pause.tar", Image(SANDBOX_IMAGE, [layer], {"Entrypoint": ["/pause"]}))
     return archive
 
 
 def wayside_archive(folder: Path, console: Console | None = None) -> Path:
-    """Write the image of the project as it is now, named WAYSIDE_IMAGE; return the archive. Raises ImageError."""
+    """Write the image of the current tree, named WAYSIDE_IMAGE; return the archive. Raises ImageError."""
     console = console or Console(stderr=True)
     base, libraries = lasting_layers(console)
     with tempfile.TemporaryDirectory(prefix="wayside-wheel-") as work:
@@ -86,7 +86,7 @@ def build_wheel(folder: Path) -> Path:
 
 
 def lasting_layers(console: Console) -> tuple[Layer, Layer]:
-    """The layers that do not change with the project: from the cache, or made. Raises ImageError."""
+    """The layers that do not change with the project, from the cache or built. Raises ImageError."""
     base = _base_layer(console)
     return base, _libraries_layer(console, base)
 
@@ -162,7 +162,7 @@ def _project_layer(wheel: Path, work: Path, folder: Path, base: Layer) -> Layer:
 
 @contextmanager
 def _within(base: Layer, target: Path) -> Iterator[Path]:
-    """Move packages into the root of the images and compile them there, by its own Python; where they are meanwhile."""
+    """Move packages into the image root and compile them there with its Python; yields their path for the block."""
     with tempfile.TemporaryDirectory(prefix="wayside-root-") as work:
         _run(["tar", "--extract", f"--file={base.path}", f"--directory={work}"])
         place = Path(work) / LIBRARIES
@@ -174,7 +174,7 @@ def _within(base: Layer, target: Path) -> Iterator[Path]:
 
 
 def _compile(root: Path, folder: str) -> None:
-    """Compile what is below a folder of the root. Bytecode that is not compared with its source contains no times."""
+    """Compile all files below a folder of the root. Bytecode that is not compared with its source contains no times."""
     options = ["--invalidation-mode=unchecked-hash", "-q", "-f", "-x", "/tests/|/lib2to3/tests/"]
     _run(["/usr/sbin/chroot", str(root), f"/usr/bin/python{PYTHON}", "-m", "compileall", *options, folder])
 
@@ -185,7 +185,7 @@ def _superfluous(place: str) -> bool:
 
 
 def _cached(name: str, made_of: str, make: Callable[[Path], Layer]) -> Layer:
-    """Take a layer from the cache, or make it."""
+    """Return a layer from the cache, or build it."""
     folder = cache() / "images"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}-{hashlib.sha256(f'{made_of} {_machine()}'.encode()).hexdigest()[:16]}.tar"

@@ -18,7 +18,7 @@ CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Layer:
-    """A tar of files, uncompressed: it travels from disk to disk."""
+    """An uncompressed tar of files: it is only copied between disks."""
 
     path: Path
     digest: str
@@ -33,7 +33,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Image:
-    """What an image is.
+    """The content and the metadata of an image.
 
     Attributes:
         name: with its tag.
@@ -110,7 +110,7 @@ def _add(tar: tarfile.TarFile, source: Path, place: str, skip: Callable[[str], b
         info.uid = info.gid = 0
         info.uname = info.gname = ""
         info.mtime = 0
-        if info.islnk():  # each name of a hard link has the content: so the order does not matter
+        if info.islnk():  # each hard link is stored with its content, so the order does not matter
             info.type, info.linkname, info.size = tarfile.REGTYPE, "", source.stat().st_size
         if info.isreg():
             with source.open("rb") as file:

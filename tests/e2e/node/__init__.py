@@ -1,7 +1,7 @@
-"""A real cluster of one node: the control plane of the cluster tests, and what runs pods.
+"""A real cluster of one node: the control plane of the cluster tests, and the programs that run pods.
 
 API server, etcd, controller manager, scheduler, kubelet, kube-proxy, containerd and CoreDNS are processes inside one
-enclosure (see `enclosure`), so the API server reaches pods, and nothing that they do to the machine outlives them. The
+enclosure (see `enclosure`), so the API server reaches pods, and their changes to the machine end with them. The
 machine reaches the node at its address: the API server, NodePorts, and nothing else.
 """
 
@@ -35,7 +35,7 @@ USERS = {  # the names that Kubernetes' own roles are bound to
     "kube-scheduler": ("system:kube-scheduler", ""),
     "coredns": ("coredns", ""),
 }
-SHIM = "containerd-shim"  # the beginning of its name: the process above the containers of a pod, which outlives others
+SHIM = "containerd-shim"  # a prefix of its name: the parent process of a pod's containers, which outlives containerd
 TO_KUBELET = "apiserver-to-kubelet"
 
 
@@ -43,9 +43,9 @@ class Node:
     """A cluster of one node; a context manager that starts and removes it.
 
     Attributes:
-        folder: its data and logs; gone after `stop()`.
+        folder: its data and logs; `stop()` removes it.
         plane: the control plane, with the kubeconfig of an administrator.
-        started_in: seconds that each step of the start took.
+        started_in: the duration of each step of the start, in seconds.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Node:
 
     @property
     def address(self) -> str:
-        """Where the machine reaches the node: the API server and NodePorts."""
+        """The address at which the machine reaches the API server and NodePorts."""
         return self.enclosure.inside
 
     def api(self, namespace: str = "default") -> Api:
@@ -93,7 +93,7 @@ class Node:
         return self.plane.api(namespace)
 
     def start(self) -> None:
-        """Start all and wait until the node is ready. Raises TimeoutError with the end of the log of what is not."""
+        """Start all and wait until the node is ready. Raises TimeoutError with the log of a program that is not."""
         try:
             self._timed("enclosure", self.enclosure.open)
             self._timed("containerd", self.start_containerd)
@@ -147,7 +147,7 @@ class Node:
         )
 
     def wait_ready(self) -> None:
-        """Wait until the node takes pods."""
+        """Wait until the node accepts pods."""
 
         def ready() -> bool:
             for child in self._children.values():
@@ -172,14 +172,14 @@ class Node:
         self._children.pop(name).kill9()
 
     def power_off(self) -> None:
-        """Kill all that runs on the node, pods and the API server too, as a power cut does; what is on disks stays."""
+        """Kill all processes of the node, pods and the API server too, as a power cut does; disks keep their data."""
         for name in reversed(tuple(self._children)):
             self.stop_program(name)
         self.enclosure.kill(SHIM)
         self.plane.stop_api_server()
 
     def power_on(self) -> None:
-        """Start what `power_off` ended, and wait until the node is ready; kubelet starts the pods again."""
+        """Start the programs that `power_off` killed and wait until the node is ready; kubelet restarts the pods."""
         self.start_containerd()
         self.plane.start_api_server()
         self._start_node()

@@ -10,13 +10,13 @@ import yaml
 
 from tests.e2e.images import SANDBOX_IMAGE
 
-PODS = "10.244.0.0/24"  # seen inside the enclosure only, as are the Services' 10.96.0.0/16
+PODS = "10.244.0.0/24"  # visible only inside the enclosure, like the Services' 10.96.0.0/16
 DOMAIN = "cluster.local"
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Where the node's things are, below its state folder."""
+    """The paths of the node's files, below its state folder."""
 
     folder: Path
 
@@ -27,7 +27,7 @@ class Paths:
 
     @property
     def kubelet(self) -> Path:
-        """kubelet's data; its configuration beside it is `kubelet.yaml`."""
+        """The data folder of kubelet; its configuration is `kubelet.yaml` beside it."""
         return self.folder / "kubelet"
 
 
@@ -56,7 +56,7 @@ disabled_plugins = ["io.containerd.internal.v1.opt", "io.containerd.nri.v1.nri"]
 
 
 def network() -> str:
-    """Return the network of the pods: a bridge, with addresses that a file keeps."""
+    """Return the network of the pods: a bridge, whose allocated addresses are in files."""
     bridge = {
         "type": "bridge",
         "bridge": "pods",
@@ -103,7 +103,7 @@ def kubelet(paths: Paths, address: str, cgroup: str, client_authority: Path, syn
 
 
 def kube_proxy(kubeconfig: Path, address: str) -> str:
-    """Return the KubeProxyConfiguration: no limits of connection tracking, which are the whole machine's."""
+    """Return the KubeProxyConfiguration: it sets no limits of connection tracking, which apply to the whole machine."""
     return yaml.safe_dump(
         {
             "apiVersion": "kubeproxy.config.k8s.io/v1alpha1",

@@ -1,11 +1,11 @@
 """The Linux namespaces of a node, with separate mounts, network and processes.
 
 Everything that a node does to a machine (network interfaces, iptables rules, mounts, daemons that outlive their parent)
-happens inside, so it neither meets what else runs on the machine nor stays: the kernel removes it all when the first
-process inside ends, also where the test run was killed (`tests.cluster.reaper`). Only cgroups live outside. They have
-the number of the test run in their name, and those of runs that are no more are removed before the next one.
+happens inside, so it neither affects other programs of the machine nor stays: the kernel removes all when the first
+process inside ends, also if the test run was killed (`tests.cluster.reaper`). Only cgroups are outside. They have
+the process id of the test run in their name, and the next run removes those of ended runs.
 
-Outside and inside are joined by one pair of interfaces, on addresses of RFC 2544 that are nobody's.
+One pair of interfaces connects outside and inside, on addresses that RFC 2544 reserves for benchmarks.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ CGROUPS = Path("/sys/fs/cgroup")
 CGROUP_PREFIX = "wayside-e2e-"
 INIT = Path(__file__).with_name("init.py")
 _numbers = itertools.count()
-ATTEMPTS = 100  # at 0.05 s: a cgroup is busy until the kernel has cleared up the last process
+ATTEMPTS = 100  # at 0.05 s: a cgroup is busy until the kernel has cleaned up its last process
 
 
 class Enclosure:
     """One set of namespaces.
 
     Attributes:
-        folder: for what is kept by those inside; it exists, and is the caller's to remove.
-        outside: the machine's address of the pair, as seen from inside.
+        folder: the data of the programs inside; it exists, and the caller removes it.
+        outside: the machine's address, as seen from inside.
         inside: the node's address.
-        cgroup: below which the node's containers are, `/wayside-e2e-<pid of the test run>-<number>`.
+        cgroup: the parent of the containers' cgroups, `/wayside-e2e-<pid of the test run>-<number>`.
         interface: the machine's end of the pair.
     """
 
     def __init__(self, folder: Path):
-        """Prepare; nothing is made yet."""
+        """Prepare; nothing is created yet."""
         self.folder = folder
         number = next(_numbers)
         self.cgroup = f"/{CGROUP_PREFIX}{os.getpid()}-{number}"
@@ -61,7 +61,7 @@ class Enclosure:
         return ("nsenter", f"--target={self._target}", "--mount", "--net", "--pid", "--")
 
     def open(self) -> None:
-        """Make the namespaces and join them to the outside. Raises TimeoutError with the log of the first process."""
+        """Create the namespaces and the link to the machine. Raises TimeoutError with the log of the first process."""
         remove_stale_cgroups()
         for root in cgroup_roots():
             (root / self.cgroup[1:]).mkdir(exist_ok=True)
@@ -99,7 +99,7 @@ class Enclosure:
         return Child(name, [*self.enter, *command], self.folder / f"{name}.log", {**os.environ, **environment})
 
     def kill(self, name: str) -> None:
-        """Kill the programs inside whose name begins so, and all in the node's cgroups; returns when all are gone."""
+        """Kill the programs inside with this name prefix and all in the node's cgroups; return when all have ended."""
 
         def left() -> list[int]:
             found = [*self._named(name), *_pids(self.cgroup[1:])]
@@ -108,7 +108,7 @@ class Enclosure:
                     os.kill(pid, signal.SIGKILL)
             return found
 
-        wait_until(left, lambda found: not found, what=f"nothing of {name} and the node's cgroups runs")
+        wait_until(left, lambda found: not found, what=f"no process of {name} or the node's cgroups runs")
 
     def _named(self, name: str) -> Iterator[int]:
         own = _namespace(self._target)
@@ -120,14 +120,14 @@ class Enclosure:
     def close(self) -> None:
         """End everything inside, and remove the cgroups."""
         if self._anchor is not None:
-            # The kernel would remove it too, some time after the last process inside.
+            # The kernel would also remove the interface, but some time after the last process inside ends.
             subprocess.run(["ip", "link", "delete", self.interface], capture_output=True, check=False)
             self._anchor.kill9()
         self._anchor, self._target = None, 0
         _remove_cgroups(self.cgroup[1:])
 
     def _join(self) -> None:
-        """Make the pair of interfaces; the first process inside waits for its end."""
+        """Create the pair of interfaces; the first process inside waits for the inner one."""
         name = self.interface
         _ip("link", "add", name, "type", "veth", "peer", "name", "uplink", "netns", str(self._target))
         _ip("address", "add", f"{self.outside}/30", "dev", name)
@@ -144,7 +144,7 @@ class Enclosure:
 
 
 def remove_stale_cgroups() -> None:
-    """Remove what test runs left that are no more."""
+    """Remove the cgroups of ended test runs."""
     for name in {path.name for root in cgroup_roots() for path in root.glob(f"{CGROUP_PREFIX}*")}:
         if not Path(f"/proc/{name.removeprefix(CGROUP_PREFIX).partition('-')[0]}").exists():
             _remove_cgroups(name)
@@ -158,7 +158,7 @@ def _pids(cgroup: str) -> set[int]:
     files = [file for root in cgroup_roots() for file in (root / cgroup).rglob("cgroup.procs")]
     found: set[int] = set()
     for file in files:
-        with contextlib.suppress(OSError):  # gone meanwhile
+        with contextlib.suppress(OSError):  # removed meanwhile
             found.update(map(int, file.read_text().split()))
     return found
 
@@ -187,14 +187,14 @@ def cgroup_roots() -> list[Path]:
 
 
 def _inherit_cpuset(cgroup: Path) -> None:
-    """Version 1 makes a cgroup without processors, in which nothing can run."""
+    """Version 1 creates a cgroup without processors, in which no process can run."""
     for name in ("cpuset.cpus", "cpuset.mems"):
         if (cgroup / name).exists() and (cgroup.parent / "cgroup.clone_children").exists():
             (cgroup / name).write_text((cgroup.parent / name).read_text())
 
 
 def _free_network() -> str:
-    """Return the first three numbers of a network to which no route leads yet."""
+    """Return the first three numbers of a /24 network without a route."""
     routes = subprocess.run(["ip", "-4", "route"], capture_output=True, text=True, check=True).stdout
     free = [f"198.18.{third}" for third in range(256) if f"198.18.{third}." not in routes]
     return random.SystemRandom().choice(free)

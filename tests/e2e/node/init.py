@@ -1,7 +1,7 @@
-"""The first process inside an enclosure: it makes the mounts and addresses, then collects what others leave orphaned.
+"""The first process inside an enclosure: it creates the mounts and addresses, then reaps orphaned processes.
 
 Called with the state folder, the node's address and the machine's. It runs as process 1 of its namespace; when it ends,
-so does everything inside.
+all processes inside end too.
 """
 
 import os
@@ -21,11 +21,11 @@ KERNEL = {
     "kernel/keys/root_maxkeys": "1000000",
     "kernel/keys/root_maxbytes": "25000000",
 }
-"""What kubelet wants of the kernel, for the whole machine. Files in their place let it believe that it is so."""
+"""The sysctls that kubelet requires, for the whole machine. Files mounted over them report the required values."""
 
 
 def enclose(folder: Path, inside: str, outside: str) -> None:
-    """Make mounts and addresses."""
+    """Create the mounts and addresses."""
     _run("mount", "--make-rshared", "/")
     _run("mount", "-t", "proc", "proc", "/proc")
     _run("mount", "-t", "tmpfs", "tmpfs", "/run")
@@ -43,14 +43,14 @@ def enclose(folder: Path, inside: str, outside: str) -> None:
     deadline = time.monotonic() + 60
     while not Path("/proc/sys/net/ipv4/conf/uplink").exists():
         if time.monotonic() > deadline:
-            raise SystemExit("the interface uplink does not come")
+            raise SystemExit("the interface uplink does not appear")
         time.sleep(0.02)
     _run("ip", "address", "add", f"{inside}/30", "dev", "uplink")
     _run("ip", "link", "set", "uplink", "up")
     _run("ip", "route", "add", "default", "via", outside)
     Path("/proc/sys/net/ipv4/ip_forward").write_text("1")
     bridged = Path("/proc/sys/net/bridge/bridge-nf-call-iptables")
-    if bridged.exists():  # else a Service that leads back to its own bridge is not translated
+    if bridged.exists():  # otherwise the address of a Service that leads back to its own bridge is not translated
         bridged.write_text("1")
     (folder / "enclosed").touch()
 
