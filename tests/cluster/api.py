@@ -27,7 +27,7 @@ Objects = list[Object]
 FIELD_MANAGER = "test"
 
 COME_BACK = frozenset({429, 503})
-"""Nothing was done, and may be soon: a fresh API server answers so while it reads what its storage has of a kind."""
+"""A retriable rejection: a fresh API server answers so until it has read a kind's objects from storage."""
 
 MERGE_PATCH = "application/merge-patch+json"
 JSON_PATCH = "application/json-patch+json"
@@ -51,7 +51,7 @@ class ApiError(Exception):
         self.message = message
 
 
-class Unreachable(Exception):  # noqa: N818  a state of the world that tests bring about
+class Unreachable(Exception):  # noqa: N818  a state that tests cause deliberately
     """No answer: the API server is unreachable."""
 
 
@@ -82,7 +82,7 @@ class Api:
     def __init__(self, kubeconfig: Path, namespace: str = "default"):
         configuration = Configuration()
         load_kube_config(config_file=str(kubeconfig), client_configuration=configuration)  # type: ignore[no-untyped-call]
-        configuration.retries = False  # a test that stops the API server wants to know
+        configuration.retries = False  # a test that stops the API server expects the error
         self._client = ApiClient(configuration)
         self._authorization = configuration.get_api_key_with_prefix("BearerToken") or ""
         self._resources: dict[str, Resource] = {}
@@ -129,7 +129,7 @@ class Api:
         return self._object("PATCH", path, query, manifest, APPLY_PATCH)
 
     def replace(self, manifest: Object, *, subresource: str = "") -> Object:
-        """Put the object as it is; with its resourceVersion, ApiError 409 if it changed meanwhile."""
+        """Update the whole object; with its resourceVersion, ApiError 409 if it changed meanwhile."""
         path = self._path(_kind(manifest), _namespace(manifest), manifest["metadata"]["name"], subresource)
         return self._object("PUT", path, {"fieldManager": FIELD_MANAGER, "fieldValidation": "Strict"}, manifest)
 
@@ -147,7 +147,7 @@ class Api:
         return self._object("POST", self._path(kind, namespace, name, subresource), body=body)
 
     def delete(self, kind: str, name: str, *, namespace: str = "", propagation: str = "Background") -> None:
-        """Delete the object, which must exist; what it owns follows by `propagation`."""
+        """Delete the object, which must exist, and its dependents according to `propagation`."""
         options = {"apiVersion": "v1", "kind": "DeleteOptions", "propagationPolicy": propagation}
         self._object("DELETE", self._path(kind, namespace, name), body=options)
 
@@ -219,7 +219,7 @@ class Api:
     def discover(self) -> set[str]:
         """Query the API server for its current kinds and return them."""
         resources: dict[str, Resource] = {}
-        for root in ("/api", "/apis"):  # the core group first: its Event wins over that of events.k8s.io
+        for root in ("/api", "/apis"):  # the core group first: its Event has precedence over that of events.k8s.io
             for group in json.loads(self.raw(root, DISCOVERY)).get("items", []):
                 group_name = group["metadata"].get("name", "")
                 for version in group["versions"]:
@@ -257,7 +257,7 @@ class Api:
         content_type: str = "application/json",
         accept: str = "application/json",
     ) -> str:
-        """Return the answer's body; ask again where the answer is to come back later."""
+        """Return the answer's body; repeat the request if the answer is to retry later."""
         deadline = time.monotonic() + PATIENCE
         while True:
             try:

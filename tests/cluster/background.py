@@ -1,4 +1,4 @@
-"""An event loop in a separate thread, like the detector's; the test takes the place of the engine."""
+"""An event loop in a separate thread, like the detector's; the test replaces the engine."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Background:
         self.api = api
 
     def start(self, work: Coroutine[object, object, Result]) -> Future[Result]:
-        """Run it beside the test."""
+        """Run the coroutine while the test continues."""
         return asyncio.run_coroutine_threadsafe(work, self.loop)
 
     def call(self, work: Coroutine[object, object, Result]) -> Result:
-        """Run it and return what it returns."""
+        """Run the coroutine and return its result."""
         return self.start(work).result(PATIENCE)
 
 
 @contextmanager
 def background(kubeconfig: Path) -> Iterator[Background]:
-    """Start a loop; cancel everything that still runs in it at the end."""
+    """Start a loop; cancel all its tasks at the end."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="background")
     thread.start()

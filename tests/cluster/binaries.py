@@ -7,7 +7,7 @@ Where they come from, in this order:
 1. the folder that `KUBEBUILDER_ASSETS` names, for each program that it has (it usually has etcd, kube-apiserver and
    kubectl, but no kube-controller-manager);
 2. the cache, `${XDG_CACHE_HOME:-~/.cache}/wayside/controlplane/<hash>/`, into which a missing program is built from
-   the Go module in `controlplane/`. The hash covers all that decides what comes out: go.mod, go.sum, flags, platform.
+   the Go module in `controlplane/`. The hash covers all inputs of the build: go.mod, go.sum, flags, platform.
 
 With `WAYSIDE_TEST_KUBERNETES=oldest` these are of the oldest Kubernetes that Wayside supports (`make compat`).
 Nothing prebuilt is ever downloaded, so the cluster tests run wherever Go modules do.
@@ -25,7 +25,7 @@ from rich.console import Console
 
 from tests.gobuild import KUBERNETES, OLDEST_KUBERNETES, BuildError, GoModule
 
-PACKAGES: Mapping[str, str] = {  # the small ones first: an error of the setup shows after seconds
+PACKAGES: Mapping[str, str] = {  # the small ones first: a setup error appears after seconds
     "etcd": "go.etcd.io/etcd/server/v3",
     "kubectl": "k8s.io/kubernetes/cmd/kubectl",
     "kube-scheduler": "k8s.io/kubernetes/cmd/kube-scheduler",
@@ -41,10 +41,10 @@ OLDEST = GoModule(
     {name: package for name, package in PACKAGES.items() if name not in ("etcd", "kubectl")},
     OLDEST_KUBERNETES,
 )
-"""Of the oldest Kubernetes that Wayside supports; etcd and kubectl are those of `MODULE`."""
+"""The programs of the oldest Kubernetes that Wayside supports; etcd and kubectl are those of `MODULE`."""
 
 VERSION = "WAYSIDE_TEST_KUBERNETES"
-"""The variable that chooses: `oldest`, else the newest."""
+"""The environment variable that selects the version: `oldest`, otherwise the newest."""
 
 
 class BinariesUnavailableError(Exception):
@@ -53,7 +53,7 @@ class BinariesUnavailableError(Exception):
 
 @dataclass(frozen=True)
 class Binaries:
-    """Where each program is."""
+    """The path of each program."""
 
     etcd: Path
     kube_apiserver: Path
@@ -65,10 +65,10 @@ class Binaries:
 def ensure_binaries(console: Console | None = None) -> Binaries:
     """Find all programs and build those that are missing.
 
-    Progress goes to `console` (default: stderr): a live line on a terminal, one line a program elsewhere.
+    Progress goes to `console` (default: stderr): a live line on a terminal, otherwise one line for each program.
 
     Raises:
-        BinariesUnavailableError: a program cannot be had, with the remedy.
+        BinariesUnavailableError: a program cannot be built; with the remedy.
     """
     console = console or Console(stderr=True)
     found = {name: path for name in PACKAGES if (path := _find(name)) is not None}
@@ -96,7 +96,7 @@ def _find(name: str) -> Path | None:
             )
         if (given := Path(assets) / name).is_file():
             return given
-        if name in ("etcd", "kube-apiserver"):  # a typing error in the variable must not start a build of minutes
+        if name in ("etcd", "kube-apiserver"):  # a typo in the variable must not start a build of minutes
             raise BinariesUnavailableError(
                 f"KUBEBUILDER_ASSETS={assets} has no {name}: add it there, or unset the variable to build all"
             )

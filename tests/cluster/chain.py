@@ -25,7 +25,7 @@ from tests.ros_messages import cdr, pose_stamped
 from wayside.api.zenoh import Zenoh, ZenohMode
 
 NEAR, BETWEEN, FAR = 100.0, 175.0, 250.0
-"""Metres: starts an episode; keeps an open one and starts none; ends it."""
+"""Metres: NEAR starts an episode; BETWEEN keeps an open one but starts none; FAR ends it."""
 
 HOLDER = "town"
 PERIOD = 0.1  # s between two poses of a vehicle
@@ -36,7 +36,7 @@ VANS: Pair = ("van1", "van2")
 BUSES: Pair = ("bus1", "bus2")
 TRAMS: Pair = ("tram1", "tram2")
 LANES = {CARS: 0.0, VANS: 10_000.0, BUSES: 20_000.0, TRAMS: 30_000.0}
-"""Where each pair drives, as y in metres: the pairs never meet."""
+"""The y coordinate of each pair in metres: pairs are never close to each other."""
 
 
 def json_pose(x: float, y: float) -> bytes:
@@ -49,7 +49,7 @@ def cdr_pose(x: float, y: float) -> bytes:
 
 
 class Vehicles:
-    """Publishes each vehicle's pose ten times a second, at the position set last."""
+    """Publishes each vehicle's pose ten times a second, at the last set position."""
 
     def __init__(self, endpoint: str, encode: Callable[[float, float], bytes] = json_pose) -> None:
         self._encode = encode
@@ -68,7 +68,7 @@ class Vehicles:
             self._where[pair[1]] = (distance, LANES[pair])
 
     def instead(self, vehicle: str, payload: Callable[[], bytes] | None) -> None:
-        """Let the vehicle send these payloads; None: its pose again."""
+        """Let the vehicle send these payloads instead of its pose; None: its pose again."""
         with self._lock:
             if payload is None:
                 self._instead.pop(vehicle, None)
@@ -122,7 +122,7 @@ class PairsNamespace:
             self.api.apply({**manifest, "metadata": metadata})
 
     def task(self, pair: Pair) -> Object | None:
-        """The pair's task that is in force, if there is one; AssertionError if there are several."""
+        """The pair's live task, if any; AssertionError if there are several."""
         found = [task for task in self.api.list("ApplicationTask") if _is_of(task, pair) and _live(task)]
         assert len(found) < 2, f"one demand has several tasks: {found}"
         return found[0] if found else None
@@ -142,12 +142,12 @@ class PairsNamespace:
         return self._wait(lambda: self.deployment(pair), f"{pair} has a Deployment")
 
     def wait_removed(self, pair: Pair) -> None:
-        """Wait until the pair's Deployment is gone."""
+        """Wait until the pair's Deployment is deleted."""
         what = f"{pair} has no Deployment"
         wait_until(lambda: self.deployment(pair), lambda it: it is None, timeout=self.patience, what=what)
 
     def live(self) -> set[str]:
-        """The subjects of all tasks that are in force."""
+        """The subjects of all live tasks."""
         return {str(task["spec"]["event"]["subject"]) for task in self.api.list("ApplicationTask") if _live(task)}
 
     def wait_condition(self, kind: str, name: str, type_: str, status: str) -> Object:
@@ -193,7 +193,7 @@ class Chain(PairsNamespace):
         return self.detector
 
     def events(self, *subject: str) -> list[Object]:
-        """The events of a client or pair so far, as the detector wrote them; of a line that is being written, none."""
+        """The events of a client or pair that the detector has written so far, without an incomplete last line."""
         file = self.folder / "events.jsonl"
         whole, _, _ = file.read_bytes().rpartition(b"\n") if file.exists() else (b"", b"", b"")
         lines = whole.decode().splitlines()
@@ -252,7 +252,7 @@ def rule(name: str = "close", *, position: str = "msg", **spec: Any) -> Object:
 
 
 def recording(**parameters: Any) -> list[Object]:
-    """The rule's actions, with more parameters for the template."""
+    """The rule's actions, with additional parameters for the template."""
     given = {"vehicles": "${[a.client, b.client]}", **parameters}
     return [{"name": "record", "deploy": {"templateName": "recorder", "parameters": given}}]
 
@@ -262,8 +262,8 @@ def template(*, linger: str = "1s", after: str = "10m") -> Object:
 
     Args:
         linger: how long the application outlives its demand.
-        after: how long the demands of a holder outlive its Lease of 15 s. By default a restart on a slow machine, too,
-            is in time.
+        after: how long the demands of a holder outlive its Lease of 15 s. The default leaves enough time for a restart
+            on a slow machine.
     """
     labels = {"pair": "${parameters.vehicles[0]}-${parameters.vehicles[1]}"}
     container = {"name": "main", "image": "app:1", "args": ["--rate=${parameters.rate}"]}

@@ -1,4 +1,4 @@
-"""Child processes with a log each, which end with the test run at the latest.
+"""Child processes, each with a log, which end with the test run at the latest.
 
 Every child has a session of its own, so a Ctrl-C in the terminal reaches only the test run, which then stops its
 children in the right order; should the test run itself be killed, the reaper kills them.
@@ -29,7 +29,7 @@ GRACE = 30
 
 
 class Child:
-    """One process, from its start to its end; stdout and stderr go to the end of `log`."""
+    """One process, from its start to its end; stdout and stderr are appended to `log`."""
 
     def __init__(self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None):
         """Start `command` with exactly this `environment` (default: that of the test run).
@@ -89,7 +89,7 @@ class Child:
         """Send SIGTERM and wait for the end; return the exit code.
 
         Raises:
-            TimeoutError: it still ran after `patience` seconds. It is killed then: not to stop is a defect of its own.
+            TimeoutError: it still ran after `patience` seconds. It is then killed: not stopping is a defect in itself.
         """
         self.signal(signal.SIGTERM)
         try:
@@ -101,7 +101,7 @@ class Child:
     def kill9(self) -> None:
         """Send SIGKILL to the whole process group, as a crash of its container would, and wait for the end."""
         self._kill_group()
-        self._process.kill()  # the group may be missing: a process that was just forked is in that of its parent
+        self._process.kill()  # the group may be missing: a process that was just forked is still in its parent's group
         self._process.wait()
 
     def resident_bytes(self) -> int:

@@ -1,8 +1,8 @@
-"""The fixtures of the cluster tests: one control plane for all workers of a run, one namespace a test.
+"""The fixtures of the cluster tests: one control plane for all workers of a run, one namespace for each test.
 
-Every test in this folder has the marker `cluster`. Those with the marker `own_control_plane` run on one of their own,
-one after the other on one worker. When one fails, the ends of the logs of its processes are part of
-the report.
+Every test in this folder has the marker `cluster`. Those with the marker `own_control_plane` run on a control plane of
+their own, one after the other on one worker. The report of a failed test includes the ends of the logs of its
+processes.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def pytest_runtest_makereport(
 
 @pytest.fixture(scope="session")
 def shared_control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
-    """A running control plane with Wayside's CRDs, the same for all tests of the run but those marked otherwise."""
+    """A running control plane with Wayside's CRDs, shared by all tests of the run that have no other marker."""
     folder = run_folder(tmp_path_factory)
     with shared(folder, "control-plane", lambda: ControlPlane(crds=CRDS, logs=folder / "control-plane")) as running:
         yield running
@@ -58,7 +58,7 @@ def shared_control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture(scope="module")
 def own_control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlPlane]:
-    """One for the marked tests of a module: they stop it, or do what every namespace notices."""
+    """A control plane for the marked tests of a module: they stop it, or affect every namespace."""
     with ControlPlane(crds=CRDS, logs=tmp_path_factory.mktemp("control-plane")) as running:
         yield running
 
@@ -70,7 +70,7 @@ def control_plane(request: pytest.FixtureRequest) -> ControlPlane:
     plane = request.getfixturevalue("own_control_plane" if own else "shared_control_plane")
     assert isinstance(plane, ControlPlane)
     if own:
-        plane.recover()  # from what the test before left stopped
+        plane.recover()  # the previous test may have left programs stopped
     return plane
 
 
@@ -78,8 +78,8 @@ def control_plane(request: pytest.FixtureRequest) -> ControlPlane:
 def namespace(control_plane: ControlPlane, request: pytest.FixtureRequest) -> str:
     """A fresh namespace that has its default service account.
 
-    It goes with the control plane. Deleting hundreds of them would keep the controllers busy for minutes, and with them
-    the tests that wait for what Kubernetes collects.
+    It is not deleted before the control plane ends. Deleting hundreds of namespaces would keep the controllers busy for
+    minutes and delay the tests that wait for the garbage collector.
     """
     return new_namespace(control_plane.api(), request.node.name)
 
@@ -122,6 +122,6 @@ def vehicles(chain: Chain) -> Iterator[Vehicles]:
 
 @pytest.fixture
 def kubelet(api: Api) -> Iterator[None]:
-    """Every pod of the test's namespace becomes ready by itself, soon after it was made."""
+    """Every pod of the test's namespace becomes ready by itself, soon after its creation."""
     with playing_kubelet(api):
         yield

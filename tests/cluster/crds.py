@@ -24,7 +24,7 @@ _TOUCH_EVERY = 2.0  # s
 def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapping[str, ApiError]:
     """Apply each CRD in the folder's YAML files and wait until it is served; return the refusals by file name.
 
-    One that is refused holds up no other: its own test fails, and those that need its kind, but not all.
+    A rejected CRD does not block the others: only its own test and the tests that need its kind fail.
 
     Raises:
         TimeoutError: an accepted one is not served after `timeout` seconds.
@@ -40,7 +40,7 @@ def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapp
     for crd in accepted:
         name = str(crd["metadata"]["name"])
         api.wait_for("CustomResourceDefinition", name, is_established, timeout=timeout, what=f"{name} is established")
-    # Established comes a moment before the API server really serves the kind, of which discovery is the witness.
+    # Established is set a moment before the API server really serves the kind; discovery shows when it does.
     kinds = {str(crd["spec"]["names"]["kind"]) for crd in accepted}
     wait_until(
         lambda: sorted(kinds - api.discover()), lambda rest: not rest, timeout=timeout, what=f"{kinds} are served"
@@ -49,10 +49,10 @@ def apply_crds(api: Api, folder: Path = CRDS, timeout: float = PATIENCE) -> Mapp
 
 
 def wait_garbage_collected(api: Api, timeout: float = 2 * PATIENCE) -> None:
-    """Wait until Kubernetes' garbage collector watches our kinds. Raises TimeoutError.
+    """Wait until Kubernetes' garbage collector watches Wayside's kinds. Raises TimeoutError.
 
-    It looks for new kinds every 30 s. Only what it watches leaves its finalizer for a deletion in the foreground. If
-    the CRDs go before, it may keep what objects of these kinds own until the CRDs are installed again.
+    It looks for new kinds every 30 s. Only for kinds that it watches does it remove the finalizer of a foreground
+    deletion. If the CRDs are deleted earlier, it may keep the dependents of their objects until the next installation.
     """
     name = "garbage-collector-probe"
     config_map = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": name}}
@@ -63,12 +63,12 @@ def wait_garbage_collected(api: Api, timeout: float = 2 * PATIENCE) -> None:
         lambda: api.find("ApplicationTemplate", name),
         lambda found: found is None,
         timeout=timeout,
-        what="the garbage collector watches our kinds",
+        what="the garbage collector watches Wayside's kinds",
     )
 
 
 def remove_crds(api: Api, names: Iterable[str], timeout: float = 2 * PATIENCE) -> None:
-    """Delete those of the CRDs that there are, and wait until none is left. Raises TimeoutError."""
+    """Delete the existing ones of the CRDs and wait until all are removed. Raises TimeoutError."""
     names = list(names)
     for name in names:
         if api.find("CustomResourceDefinition", name) is not None:
@@ -78,10 +78,10 @@ def remove_crds(api: Api, names: Iterable[str], timeout: float = 2 * PATIENCE) -
 
 
 def wait_crd_gone(api: Api, name: str, timeout: float = 2 * PATIENCE) -> None:
-    """Wait until a CRD that is being deleted is gone. Raises TimeoutError.
+    """Wait until a CRD that is being deleted is removed. Raises TimeoutError.
 
-    Of one that was made or changed just before, the API server finds that its "storage is (re)initializing", and looks
-    again when the CRD changes, else only minutes later. So it is changed.
+    For a CRD that was just created or changed, the API server finds that its "storage is (re)initializing". It retries
+    when the CRD changes, otherwise only minutes later. So this function changes the CRD.
     """
     touched = time.monotonic()
 
@@ -90,7 +90,7 @@ def wait_crd_gone(api: Api, name: str, timeout: float = 2 * PATIENCE) -> None:
         found = api.find("CustomResourceDefinition", name)
         if found is not None and time.monotonic() - touched > _TOUCH_EVERY:
             touched = time.monotonic()
-            with suppress(ApiError):  # it went just now
+            with suppress(ApiError):  # it was removed just now
                 api.patch("CustomResourceDefinition", name, {"metadata": {"annotations": {"touched": str(touched)}}})
         return found
 

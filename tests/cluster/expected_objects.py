@@ -1,7 +1,7 @@
 """The objects that the manager should have created in a namespace, computed from the live objects, and the differences.
 
-The expectation comes from `demand` and `Renderer`, called here on the live objects: whatever the manager has been
-through, after a while the cluster must equal this pure function of it, and nothing else may have the manager's label.
+The expectation comes from `demand` and `Renderer`, called here on the live objects: regardless of the manager's
+history, the cluster must eventually equal this pure function of them, and no other object may have the manager's label.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.cluster.waiting import wait_until
 from tests.patience import PATIENCE
 from wayside.api import ApplicationInstance, ApplicationTask, ApplicationTemplate
 
-KINDS = ("Deployment", "ConfigMap", "Service", "HorizontalPodAutoscaler")  # those that the tests' templates make
+KINDS = ("Deployment", "ConfigMap", "Service", "HorizontalPodAutoscaler")  # the kinds that the tests' templates create
 MANAGED = "app.kubernetes.io/managed-by=wayside"
 
 
@@ -38,7 +38,7 @@ def start_manager(
 ) -> Process:
     """Start `application-manager run` for the namespace (default: all) and wait until it watches.
 
-    It receives its identity, like a pod's container: restarted, it takes its own Lease at once.
+    It receives an identity, as in a pod: after a restart it reacquires its own Lease at once.
     """
     where = ["--namespace", namespace] if namespace is not None else []
     environment = {"POD_NAME": "manager", "POD_UID": secrets.token_hex(8)}
@@ -57,20 +57,20 @@ def wait_settled(
     refused: Collection[str] = (),
     limit: int | None = None,
 ) -> None:
-    """Wait until the namespace is as what is live in it demands.
+    """Wait until the objects of the namespace match its live demands.
 
     Args:
         api: for the namespace.
         timeout: seconds.
-        lost: holders that are to count as lost.
-        refused: instances whose objects the API server refuses; these are not looked at.
-        limit: how many instances the namespace may have.
+        lost: holders to treat as lost.
+        refused: instances whose objects the API server rejects; these are not compared.
+        limit: the maximum number of instances in the namespace.
     """
     wait_until(
         lambda: list(differences(api, lost or {}, refused, limit)),
         lambda found: not found,
         timeout=timeout,
-        what="the cluster equals the pure function of what is live",
+        what="the cluster equals the pure function of the live objects",
     )
 
 
@@ -88,7 +88,7 @@ def differences(
     expected: set[tuple[str, str]] = set()
     for name, instance in instances.items():
         decision = outcome.instances[name]
-        if decision.paused:  # left as it is, whatever that may be
+        if decision.paused:  # left unchanged, in any state
             expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
             continue
         if decision.demanded:
@@ -98,9 +98,9 @@ def differences(
                 yield f"{name}: suspended is {instance.spec.suspended}, not {decision.suspended}"
         elif is_managed(instance) and not is_held(instance):
             if instance.status is None or instance.status.release_time is None:
-                yield f"{name}: nobody demands it, and it does not linger"
+                yield f"{name}: no task demands it, and it does not linger"
             elif decision.release_time is not None and decision.release_time < time.time():
-                yield f"{name}: nobody demands it, and its linger is over"
+                yield f"{name}: no task demands it, and its linger has ended"
         if name in refused:
             expected |= {key for key, raw in objects.items() if name in raw["metadata"]["labels"].values()}
         else:
@@ -108,7 +108,7 @@ def differences(
     for name in outcome.instances.keys() - instances.keys():
         yield f"{name}: should exist"
     for leaked in objects.keys() - expected:
-        yield f"{leaked}: has our label, and belongs to nothing"
+        yield f"{leaked}: has the manager's label, but belongs to no instance"
     yield from _tasks(tasks, outcome)
 
 
@@ -131,7 +131,7 @@ def _objects(
         rendering = Renderer(template, Policy()).render(instance) if isinstance(template, ApplicationTemplate) else None
     except RenderError:
         rendering = None
-    if rendering is None:  # the last good state stays
+    if rendering is None:  # the last good state is kept
         return set(recorded)
     for manifest in rendering.manifests:
         key = (manifest["kind"], manifest["metadata"]["name"])
@@ -144,7 +144,7 @@ def _objects(
         if owners != [instance.metadata.uid]:
             yield f"{instance.name}: {key} is owned by {owners}"
         if recorded.get(key) != live["metadata"]["uid"]:
-            yield f"{instance.name}: the status knows {recorded.get(key)} as the uid of {key}"
+            yield f"{instance.name}: the status has {recorded.get(key)} as the uid of {key}"
         yield from (f"{instance.name}: {key} {problem}" for problem in _unlike(manifest, live, ""))
     if status is None or status.spec_hash != rendering.digest:
         yield f"{instance.name}: specHash is not that of its manifests"
@@ -182,11 +182,11 @@ def _tasks(tasks: list[ApplicationTask], outcome: NamespaceOutcome) -> Iterator[
                 yield f"task {task.name}: {each.type} is {logged.get(each.type)}, not {(each.status, each.reason)}"
 
 
-# --- What the tests make
+# --- Objects of the tests
 
 
 def template(name: str = "app", *, image: str = "app:1", linger: str = "1s", **spec: Any) -> Object:
-    """A template of one Deployment for each region."""
+    """A template with one Deployment for each region."""
     keyed = {"parameters": {"region": {"type": "string", "required": True}}, "key": "${parameters.region}"}
     return {
         "apiVersion": "wayside.dev/v1alpha1",
@@ -213,7 +213,7 @@ def config(data: Mapping[str, str], name: str = "${instance.name}-config") -> Ob
 
 
 def task(name: str, *, of: str = "app", holder: str | None = None, **parameters: Any) -> Object:
-    """A task for a region, by default that of its own name."""
+    """A task for a region, by default the region with the task's name."""
     spec: Object = {"templateName": of, "parameters": {"region": name} | parameters}
     if holder is not None:
         spec["requester"] = {"holder": holder}
@@ -221,24 +221,24 @@ def task(name: str, *, of: str = "app", holder: str | None = None, **parameters:
 
 
 def end(api: Api, name: str) -> None:
-    """End a task's demand, as its holder does."""
+    """End a task's demand, as its holder would."""
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     api.patch("ApplicationTask", name, {"spec": {"endTime": now}})
 
 
 def condition(raw: Object, type_: str) -> Object:
-    """The object's condition of the type; empty where it has none."""
+    """The object's condition of the type; empty if it has none."""
     conditions = raw.get("status", {}).get("conditions", [])
     found: Object = next((each for each in conditions if each["type"] == type_), {})
     return found
 
 
 def has_status(raw: Object) -> bool:
-    """Whether the manager has written the status: a new object has Ready Unknown, of generation 0."""
+    """Whether the manager has written the status: a new object has Ready Unknown with observedGeneration 0."""
     return condition(raw, "Ready").get("observedGeneration", 0) > 0
 
 
 def only_instance(api: Api) -> Object:
-    """The one instance that there is."""
-    (found,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="there is one instance")
+    """The only existing instance."""
+    (found,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="exactly one instance exists")
     return found

@@ -1,7 +1,7 @@
-"""A proxy before the API server that simulates failures of networks and loaded servers for one program.
+"""A proxy in front of the API server that simulates network failures and loaded servers for one program.
 
-It speaks plain HTTP on loopback and hands everything on with the program's own credentials, watches included. What it
-shall do wrong is set from the test's thread at any time; what it saw is read from there.
+It speaks plain HTTP on loopback and forwards everything, including watches, with the program's own credentials. The
+test's thread can set the failures and read the seen requests at any time.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _HOP = frozenset({"connection", "content-length", "content-encoding", "host", "k
 
 @dataclass
 class ProxiedRequest:
-    """One request: its monotonic time and the status of the answer (0: none yet).
+    """One request: its monotonic time and the status of its answer (0: none yet).
 
-    `refused`: by the proxy, since an API server itself may have reasons to answer the same.
+    `refused`: whether the proxy rejected it; the API server may answer with the same status.
     """
 
     method: str
@@ -43,10 +43,10 @@ class Proxy:
     """The settings of the proxy and the requests that it has seen.
 
     Attributes:
-        cut: nothing gets through: requests are left without an answer, and open watches are broken.
-        refuse: for a request, the status and Retry-After (seconds) to answer it with; None hands it on.
+        cut: no data passes: requests get no answer, and open watches break.
+        refuse: for a request, the status and Retry-After (seconds) of the answer; None forwards the request.
         seen: all requests.
-        most: requests that were under way at the same time at the most, without watches.
+        most: the maximum number of concurrent requests so far, without watches.
     """
 
     url: str = ""
@@ -55,22 +55,22 @@ class Proxy:
     seen: list[ProxiedRequest] = field(default_factory=list)
     most: int = 0
     under_way: int = 0
-    slow: float = 0.0  # s by which every answer is late
-    hushed: frozenset[int] = frozenset()  # indexes in `seen` of watches whose connection stands and brings nothing
+    slow: float = 0.0  # s that every answer is delayed
+    hushed: frozenset[int] = frozenset()  # indexes in `seen` of watches whose connection is open but silent
 
     def writes(self) -> list[ProxiedRequest]:
-        """The requests that change anything but a Lease; a question about rights changes nothing."""
+        """The requests that change any object but a Lease; access reviews change nothing."""
         others = ("/leases", "/selfsubjectaccessreviews")
         return [each for each in self.seen if each.method != "GET" and not any(other in each.path for other in others)]
 
     def lease_writes(self) -> list[ProxiedRequest]:
-        """The requests that changed a Lease, and whose answers came."""
+        """The answered requests that changed a Lease."""
         return [each for each in self.seen if each.method != "GET" and "/leases" in each.path and each.status]
 
 
 @contextmanager
 def faulty_proxy(kubeconfig: Path) -> Iterator[tuple[Proxy, Path]]:
-    """Run one in a thread, before the API server of the kubeconfig; yields it, and a kubeconfig that leads there."""
+    """Run a proxy in a thread, in front of the kubeconfig's API server; yields it and a kubeconfig for it."""
     written = yaml.safe_load(kubeconfig.read_text())
     target = written["clusters"][0]["cluster"]["server"]
     proxy, loop = Proxy(), asyncio.new_event_loop()
@@ -159,7 +159,7 @@ async def _answer(
 
 
 async def _chunks(proxy: Proxy, answer: aiohttp.ClientResponse) -> AsyncIterator[bytes]:
-    """The body as it comes; breaks when the network is cut."""
+    """The body in the chunks received; breaks when the network is cut."""
     reading = asyncio.ensure_future(answer.content.readany())
     try:
         while True:
@@ -177,5 +177,5 @@ async def _chunks(proxy: Proxy, answer: aiohttp.ClientResponse) -> AsyncIterator
 
 
 async def _while_cut(proxy: Proxy) -> None:
-    while proxy.cut:  # noqa: ASYNC110  it is set by another thread
+    while proxy.cut:  # noqa: ASYNC110  another thread sets it
         await asyncio.sleep(0.05)

@@ -1,4 +1,4 @@
-"""What the API server must keep from changing: immutable fields of each kind, with its messages."""
+"""The updates that the API server must reject: immutable fields of each kind, with the messages."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ def new_namespace(api: Api, test: str) -> str:
 
 @contextmanager
 def fresh_namespace(api: Api, test: str) -> Iterator[str]:
-    """The same, deleted after the block without waiting: on a node its pods run, and benchmarks want it quiet."""
+    """A new namespace that is deleted after the block without waiting, since its pods would run on a node."""
     name = new_namespace(api, test)
     yield name
     try:
         api.delete("Namespace", name)
     except Unreachable:
-        return  # a test that failed while the API server was away: the session's data goes soon anyway
+        return  # a test failed while the API server was stopped: the session's data is removed soon anyway
     except ApiError as error:
-        if error.code != 404:  # the test may have deleted it
+        if error.code != 404:  # the test may have deleted the namespace
             raise

@@ -11,13 +11,13 @@ from contextlib import contextmanager, suppress
 from tests.cluster.api import Api, ApiError, Object, Unreachable
 from tests.cluster.repeating import repeated
 
-KUBELET_INTERVAL = 0.2  # s between two looks at the pods
+KUBELET_INTERVAL = 0.2  # s between two lists of the pods
 
 
 def mark_pods_ready(api: Api, selector: str = "", *, namespace: str = "") -> list[str]:
     """Write the status Ready to all pods that match the label selector, as a kubelet would; return the marked pods.
 
-    Pods that are ready or being deleted, or vanish meanwhile, are left out.
+    Skips pods that are ready, are being deleted or are removed meanwhile.
     """
     marked: list[str] = []
     for pod in api.list("Pod", labels=selector, namespace=namespace):
@@ -62,7 +62,7 @@ def kubelet(api: Api) -> Iterator[None]:
     """Mark each new pod of the default namespace of `api` ready, for the duration of a `with` block."""
 
     def mark() -> None:
-        with suppress(Unreachable):  # an outage that the test brought about
+        with suppress(Unreachable):  # an outage that the test caused
             mark_pods_ready(api)
 
     with repeated("kubelet", mark, KUBELET_INTERVAL):

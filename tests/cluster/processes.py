@@ -1,4 +1,4 @@
-"""Wayside's own programs as processes of a test: started, killed, started again, with a log each."""
+"""Wayside's own programs as processes of a test: started, killed and restarted, each with a log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def environment_of(kubeconfig: Path) -> dict[str, str]:
 
 
 class Process:
-    """One program, through all its restarts; they share one log, with a line between them.
+    """One program through all its restarts, which share one log with a separating line.
 
     Attributes:
         name: unique in the test, names the log.
@@ -42,7 +42,7 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """The process id of the present run."""
+        """The process id of the current run."""
         return self._child.pid
 
     @property
@@ -52,11 +52,11 @@ class Process:
 
     @property
     def returncode(self) -> int | None:
-        """The exit code of the present run, negative for a signal; None while it is alive."""
+        """The exit code of the current run, negative for a signal; None while it is alive."""
         return self._child.returncode
 
     def resident_bytes(self) -> int:
-        """The memory that the present run holds now; 0 where the system does not report it."""
+        """The memory that the current run uses; 0 if the system does not report it."""
         return self._child.resident_bytes()
 
     def terminate(self, patience: float = PATIENCE) -> int:
@@ -64,7 +64,7 @@ class Process:
         return self._child.terminate(patience)
 
     def kill9(self) -> None:
-        """Send SIGKILL to it and to all that it started."""
+        """Send SIGKILL to it and to all its children."""
         self._child.kill9()
 
     def wait(self, timeout: float = PATIENCE) -> int:
@@ -82,21 +82,21 @@ class Process:
         self.start()
 
     def output(self) -> str:
-        """Return what the present run has written."""
+        """Return the output of the current run."""
         with self.log.open("rb") as log:
             log.seek(self._seen_from)
             return log.read().decode(errors="replace")
 
     def wait_for_output(self, pattern: str, timeout: float = PATIENCE) -> re.Match[str]:
-        """Wait until the output of the present run matches; return the match.
+        """Wait until the output of the current run matches; return the match.
 
         Raises:
-            TimeoutError: it does not after `timeout` seconds; with the end of the log.
-            ChildProcessError: it ended without.
+            TimeoutError: no match after `timeout` seconds; with the end of the log.
+            ChildProcessError: the program ended without a match.
         """
 
         def look() -> re.Match[str] | None:
-            alive = self.alive  # before the output: what it wrote last still counts
+            alive = self.alive  # before the output is read, so that its last output counts
             found = re.search(pattern, self.output(), re.MULTILINE)
             if found is None and not alive:
                 raise ChildProcessError(f"{self.name} ended without writing {pattern!r}\n{self._child.tail()}")
@@ -123,7 +123,7 @@ class Processes:
     """All programs of one test."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]):
-        """Start none yet. Logs go to `folder`; every program gets `environment` beside that of the test run."""
+        """Start none yet. Logs are in `folder`; every program has `environment` in addition to that of the test run."""
         self.folder = folder
         self.environment = dict(environment)
         self._all: dict[str, Process] = {}
@@ -134,14 +134,14 @@ class Processes:
         Args:
             command: a console script of this project, or any program on PATH, and its arguments.
             name: for the log and for messages; default: the program's, numbered if there are several.
-            environment: what this program gets beside the environment of all.
+            environment: additional variables of this program.
         """
         name = name or self._free_name(command[0])
         if name in self._all:
             raise ValueError(f"a process {name!r} already exists: give another name, or restart that one")
         script = BIN / command[0]
         argv = [str(script) if script.exists() and command[0] not in PROGRAMS else command[0], *command[1:]]
-        # A program's own output must not sit in a buffer while a test waits for it.
+        # A program's output must not stay in a buffer while a test waits for it.
         everything = os.environ | {"PYTHONUNBUFFERED": "1"} | self.environment | dict(environment or {})
         process = Process(name, argv, self.folder / f"{name}.log", everything)
         self._all[name] = process
@@ -152,7 +152,7 @@ class Processes:
         return "\n".join(process.tail(lines) for process in self._all.values())
 
     def kill_all(self) -> None:
-        """Kill what still runs."""
+        """Kill all programs that still run."""
         for process in self._all.values():
             process.kill9()
 

@@ -1,9 +1,9 @@
 """Cleans up after a killed test run.
 
-A test run that is killed cannot stop its processes any more. So one small process reads, from a pipe that only the test
-run holds, what there is: `+<pid>` a process started, `-<pid>` it ended, `/<path>` a folder to remove. When the pipe
-closes, it kills the groups of the processes that are left and removes the folders that are. (PR_SET_PDEATHSIG would
-need no process, but it fires when the *thread* that started a child ends.)
+A killed test run cannot stop its processes. So one small process reads messages from a pipe that only the test run
+holds: `+<pid>` a process started, `-<pid>` it ended, `/<path>` a folder to remove. When the pipe closes, it kills the
+groups of the remaining processes and removes the remaining folders. (PR_SET_PDEATHSIG would need no process,
+but it fires when the *thread* that started a child ends.)
 """
 
 import os
@@ -17,7 +17,7 @@ ATTEMPTS = 50  # at 0.1 s: a killed process may still write for a moment
 
 
 def reap(messages: Iterable[str]) -> None:
-    """Follow the messages to their end, then kill each process group and remove each folder that is left."""
+    """Read the messages to their end, then kill each remaining process group and remove each remaining folder."""
     living: set[int] = set()
     folders: set[str] = set()
     for message in messages:

@@ -20,12 +20,12 @@ def repeated(name: str, do: Callable[[], None], interval: float) -> Iterator[Non
     def run() -> None:
         try:
             while True:
-                last = ended.is_set()  # looked at before, so that the last call is one after the block's end
+                last = ended.is_set()  # checked first, so that the last call comes after the end of the block
                 do()
                 if last:
                     return
                 ended.wait(interval)
-        except Exception as error:  # noqa: BLE001  not lost: the end of the block raises it
+        except Exception as error:  # noqa: BLE001  raised at the end of the block
             failures.append(error)
 
     thread = threading.Thread(target=run, name=name, daemon=True)

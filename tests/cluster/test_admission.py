@@ -52,7 +52,7 @@ def rule(name: str = "close", **spec: Any) -> Object:
 
 
 def reported(api: Api, kind: str, name: str) -> Object:
-    """The condition Accepted, once it speaks of the spec as it is."""
+    """The condition Accepted, once it is about the current spec."""
     found = api.wait_for(
         kind,
         name,
@@ -63,7 +63,7 @@ def reported(api: Api, kind: str, name: str) -> Object:
 
 
 WRONG: list[tuple[Object, Object, list[str]]] = [
-    # a good object, the change that makes it wrong, and the message
+    # a valid object, the change that makes it invalid, and the message
     (
         template("unknown"),
         {"manifests": [deployment("app:${parameters.version}")]},
@@ -125,7 +125,7 @@ WRONG: list[tuple[Object, Object, list[str]]] = [
 
 
 def spoilt(good: Object, change: Object) -> Object:
-    """The patch that makes the object wrong."""
+    """The patch that makes the object invalid."""
     if isinstance(change.get("streams"), str):  # of a stream's stamp
         streams = copy.deepcopy(good["spec"]["streams"])
         streams[0]["stamp"] = change["streams"]
@@ -200,7 +200,7 @@ def test_kubectl_prints_rejections_and_warnings_as_the_guide_shows(
 
 def test_only_a_changed_spec_is_rejected(api: Api, webhook: Webhook) -> None:
     wrong = template("wrong", manifests=[config({}, name="fixed")])
-    api.create(wrong)  # while nothing calls it
+    api.create(wrong)  # while the API server does not call the webhook
     with webhook.requested():
         api.patch("ApplicationTemplate", "wrong", {"metadata": {"labels": {"a": "b"}, "finalizers": ["test.dev/x"]}})
         status = {"status": {"instances": 7}}
@@ -240,7 +240,7 @@ def test_a_detectors_pod_is_checked_by_a_dry_run(api: Api, processes: Processes,
             with pytest.raises(ApiError, match=parts):
                 api.create({**made, "spec": made["spec"] | {"pod": pod}})
         api.create({**made, "spec": made["spec"] | {"pod": {"affinity": placed("Exists")}}})
-        api.wait_for("Deployment", "detector-intersection-a", lambda _: True, what="the detector's Deployment is made")
+        api.wait_for("Deployment", "detector-intersection-a", lambda _: True, what="the detector is deployed")
     assert [each["metadata"]["name"] for each in api.list("Deployment")] == ["detector-intersection-a"]
 
 
@@ -268,7 +268,7 @@ def test_a_renewed_certificate_is_served_and_an_unusable_one_is_not(api: Api, we
         webhook.manager.wait_for_output("are not a certificate and a key .* keeping the previous certificate")
         webhook.wait_answering()
         key.write_bytes(old)
-        api.apply(webhook.certified())  # another authority: what it did not sign is not trusted
+        api.apply(webhook.certified())  # another authority: its clients trust only certificates that it signed
         webhook.manager.wait_for_output("using the renewed certificate")
         webhook.wait_answering()
 
@@ -325,7 +325,7 @@ def test_tasks_instances_statuses_and_deletions_are_never_reviewed(
                 what="the API server calls the webhook for templates",
             )
             api.create(task("north"))
-            (made,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="an instance is made")
+            (made,) = api.wait_list("ApplicationInstance", lambda found: len(found) == 1, what="an instance is created")
             end(api, "north")
             api.wait_gone("ApplicationInstance", made["metadata"]["name"])
             api.create(detector())

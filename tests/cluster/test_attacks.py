@@ -47,7 +47,7 @@ def attacked(api: Api, namespace: str, control_plane: ControlPlane, processes: P
     manager = start_manager(processes, namespace, kubeconfig=account)
     api.create(template("good", manifests=[pod()]))
     api.create(task("north", of="good"))
-    api.wait_for("Deployment", instance_name("good", "north"), lambda _: True, what="the good one runs")
+    api.wait_for("Deployment", instance_name("good", "north"), lambda _: True, what="the good application runs")
     return manager
 
 
@@ -58,7 +58,7 @@ def served(api: Api, name: str) -> None:
 
 
 def pod(security: Object | None = None, **spec: Any) -> Object:
-    """A Deployment whose pod meets the restricted standard but for these fields; `security`: of its container."""
+    """A Deployment whose pod meets the restricted standard except for these fields; `security`: of its container."""
     made = deployment()
     made["spec"]["template"]["spec"] |= spec
     meets = {"allowPrivilegeEscalation": False, "runAsNonRoot": True, "capabilities": {"drop": ["ALL"]}}
@@ -111,7 +111,7 @@ BY_TEMPLATE: dict[str, tuple[Object, str]] = {
     ),
     "finalizer": (named("${instance.name}", finalizers=["a.example/b"]), "metadata.finalizers"),
 }
-"""Manifests that the manager rejects, and a part of the reason."""
+"""Manifests that the manager rejects, each with a part of the reason."""
 
 HOST: dict[str, tuple[Object, Object, str]] = {
     "network": ({"hostNetwork": True}, {}, "hostNetwork=true"),
@@ -121,11 +121,11 @@ HOST: dict[str, tuple[Object, Object, str]] = {
     "root": ({}, {"runAsUser": 0}, "must not set runAsUser=0"),
     "capabilities": ({}, {"capabilities": {"drop": ["ALL"], "add": ["SYS_ADMIN"]}}, 'must not include "SYS_ADMIN"'),
 }
-"""What of the node a pod may not have: fields of the pod and of its container's security context, and part of the
-reason. Otherwise the pod meets the namespace's standard."""
+"""Access to the node that a pod may not have: fields of the pod and of its container's security context, and part of
+the reason. Otherwise the pod meets the namespace's standard."""
 
 HOSTILE = ("../../x", "x: y\n", '"}', "${parameters.region}", "$${v}", "'; drop", "{{ .Values }}", "\u202e", "system")
-"""Values of parameters that mean something elsewhere."""
+"""Parameter values that have a meaning in other languages."""
 
 
 def refusal(api: Api, name: str) -> str:
@@ -146,7 +146,7 @@ def test_no_forbidden_object_is_created(api: Api, attacked: Process) -> None:
     wait_until(
         lambda: {name: refusal(api, name) for name, (_, part) in BY_TEMPLATE.items() if part not in refusal(api, name)},
         lambda wrong: not wrong,
-        what="each is refused with its reason",
+        what="each is rejected with its reason",
     )
     for name, (_, _, part) in HOST.items():
         api.wait_for(
@@ -156,13 +156,13 @@ def test_no_forbidden_object_is_created(api: Api, attacked: Process) -> None:
             what=f"the status contains {part}",
         )
     served(api, "later")
-    api.wait_list("Pod", lambda found: len(found) == 2, what="what meets the standard has its pods")
+    api.wait_list("Pod", lambda found: len(found) == 2, what="the application that meets the standard has its pods")
     assert {each["metadata"]["uid"] for each in api.list("ConfigMap", namespace="kube-system")} == mine
     assert {each["metadata"]["labels"]["app"] for each in api.list("Pod")} == {
         instance_name("good", name) for name in ("north", "later")
     }
     made = [(each["kind"], each["metadata"]["name"]) for kind in MADE for each in api.list(kind, labels=OURS)]
-    attempts = [f"host-{name}" for name in HOST if name != "privileges"]  # that the API server refuses in a Deployment
+    attempts = [f"host-{name}" for name in HOST if name != "privileges"]  # the API server rejects it in a Deployment
     assert sorted(made) == sorted(
         ("Deployment", instance_name(name, key))
         for name, key in [("good", "north"), ("good", "later"), *((each, "north") for each in attempts)]
@@ -282,16 +282,16 @@ FREE: dict[tuple[str, str], Object] = {
     ("EventRule", "actions[].plugin.parameters{}"): action(plugin={"name": "p", "parameters": LARGE}),
     ("EventRule", "actions[].plugin.values{}"): action(plugin={"name": "p", "values": {"v": LARGE}}),
 }
-"""900 kB in each field that takes any data: by kind and field, the spec; of an EventRule what it has besides."""
+"""900 kB in each field of free-form data: the spec by kind and field; for an EventRule its other fields."""
 
 
 def free_fields() -> Iterator[tuple[str, str]]:
-    """The fields of all kinds' specs that take any data."""
+    """The fields of free-form data in the specs of all kinds."""
 
     def walk(schema: Object, path: str) -> Iterator[str]:
         if schema.get("x-kubernetes-preserve-unknown-fields"):
             yield path.removeprefix(".")
-            return  # what is deeper is free as well
+            return  # all deeper fields are free-form as well
         for name, child in schema.get("properties", {}).items():
             yield from walk(child, f"{path}.{name}")
         for key, sign in (("items", "[]"), ("additionalProperties", "{}")):
@@ -323,7 +323,7 @@ def test_900_kb_in_every_field_that_takes_free_data_harms_no_other(api: Api, att
 
 
 def refused(api: Api, manifest: Object) -> str:
-    """Why the API server does not store the object, empty where it does."""
+    """The reason why the API server rejects the object; empty if it stores it."""
     try:
         api.create(manifest)
     except ApiError as error:

@@ -1,7 +1,7 @@
 """Bad input to the chain: each has a helpful message, and a well-behaved pair's episode is not affected.
 
-In each test CARS are the well-behaved pair. Their episode is open before the bad input comes, is held through it with
-the two at 175 m, and ends as it should afterwards.
+In each test CARS are the well-behaved pair. Their episode opens before the bad input, stays open
+during it with the two at 175 m, and ends as expected afterwards.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def chain(api: Api, namespace: str, processes: Processes, tmp_path: Path) -> Cha
 
 @contextmanager
 def unharmed(chain: Chain, vehicles: Vehicles, running: Process) -> Iterator[None]:
-    """The well-behaved pair's episode is open during the block, and neither it nor its Deployment notices."""
+    """The well-behaved pair's episode is open during the block; neither it nor its Deployment changes."""
     vehicles.place(CARS, NEAR)
     deployed = chain.wait_deployed(CARS)
     task = chain.wait_task(CARS)
@@ -74,7 +74,7 @@ def unharmed(chain: Chain, vehicles: Vehicles, running: Process) -> Iterator[Non
 def in_turn(*payloads: Callable[[], bytes]) -> Callable[[], bytes]:
     """Repeat the items endlessly."""
     following = cycle(payloads)
-    return lambda: next(following)()  # noqa: PLW0108  the next one each time, not the first for ever
+    return lambda: next(following)()  # noqa: PLW0108  each call returns the next item
 
 
 def test_a_client_with_unreadable_or_invalid_poses_affects_no_other_client(chain: Chain) -> None:
@@ -116,7 +116,7 @@ def test_json_of_the_wrong_shape_affects_no_other_client(chain: Chain) -> None:
 
 
 def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *logged: str) -> None:
-    """One of another pair sends only bad poses for a while: that is logged, and the pair's own episode is kept, too."""
+    """One vehicle of another pair sends only bad poses for a while: this is logged, and the pair's episode stays open."""
     running = chain.start()
     with unharmed(chain, vehicles, running):
         vehicles.place(VANS, NEAR)
@@ -124,9 +124,9 @@ def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *lo
         vehicles.instead("van1", bad)
         for line in logged:
             running.wait_for_output(line)
-        vehicles.place(BUSES, NEAR)  # once theirs is there, the bad poses have been evaluated many times
+        vehicles.place(BUSES, NEAR)  # once their Deployment exists, the bad poses have been evaluated many times
         chain.wait_deployed(BUSES)
-        assert untouched(deployed, chain.deployment(VANS)), "while a position is unknown, nothing ends"
+        assert untouched(deployed, chain.deployment(VANS)), "no episode ends while a position is unknown"
         vehicles.instead("van1", None)
         vehicles.place(VANS, FAR)
         chain.wait_events(VANS, "started", "Until")
@@ -147,7 +147,7 @@ def test_with_clock_data_a_client_whose_clock_is_ahead_affects_no_other_client(c
         running.wait_for_output(
             r"because their stamps are ahead of the rest; the last: van1 is 3[56]\d\d(\.\d+)? s ahead"
         )
-        vehicles.place(BUSES, NEAR)  # time advances by the others' stamps
+        vehicles.place(BUSES, NEAR)  # the stamps of the others advance the time
         chain.wait_events(BUSES, "started")
 
 
@@ -210,7 +210,7 @@ def test_a_rule_that_names_a_missing_template_has_a_task_that_reports_it(chain: 
 
 
 def of_vans(actions: list[Object]) -> Object:
-    """Another rule, which the well-behaved pair is no subject of."""
+    """Another rule, whose subjects exclude the well-behaved pair."""
     bad = rule("bad", actions=actions)
     bad["spec"]["scope"]["pairs"]["where"] = f"a.client == '{VANS[0]}'"
     return bad
@@ -223,7 +223,7 @@ def refusal(chain: Chain, of_rule: str) -> Object:
         conditions = [condition(task, "Accepted") for task in tasks if task["spec"]["event"]["rule"] == of_rule]
         return [each for each in conditions if each.get("status") == "False"]
 
-    tasks = chain.api.wait_list("ApplicationTask", lambda tasks: bool(refused(tasks)), what="the task is refused")
+    tasks = chain.api.wait_list("ApplicationTask", lambda tasks: bool(refused(tasks)), what="the task is rejected")
     return refused(tasks)[0]
 
 

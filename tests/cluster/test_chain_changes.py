@@ -89,10 +89,10 @@ def test_a_detector_is_changed_while_it_runs(chain: Chain, vehicles: Vehicles) -
     for feeling, kinds in (("happy", ["started"]), ("sad", ["started", "Until"])):
 
         def heard(message: bytes = f'{{"mood": "{feeling}"}}'.encode()) -> list[str]:
-            vehicles.send("vehicles/car1/mood", message)  # again and again: the detector may just be subscribing
+            vehicles.send("vehicles/car1/mood", message)  # repeatedly: the detector may still be subscribing
             return [kind_of(event) for event in chain.events("car1")]
 
-        wait_until(heard, kinds.__eq__, what="the new stream is followed")
+        wait_until(heard, kinds.__eq__, what="the detector receives the new stream")
     assert untouched(deployed, chain.deployment(CARS))
     assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
     chain.wait_events(CARS, "started")

@@ -98,7 +98,7 @@ def test_an_outage_of_the_api_server_releases_nothing_and_loses_nothing(
         chain.wait_events(TRAMS, "started")
         vehicles.place(TRAMS, FAR)
         chain.wait_events(TRAMS, "started", "Until")
-        rest = 20 - (time.monotonic() - began)  # longer than the Lease holds: the outage is what is tested
+        rest = 20 - (time.monotonic() - began)  # longer than the Lease: the outage is under test
         time.sleep(max(rest, 0.0))
     chain.wait_deployed(BUSES)
     chain.wait_removed(VANS)
@@ -123,7 +123,7 @@ def test_a_detector_ends_and_starts_while_the_api_server_is_away(
         assert running.terminate() == 0
         vehicles.place(CARS, BETWEEN)
         running.start()
-        running.wait_for_output("WARNING")  # it logs what it waits for
+        running.wait_for_output("WARNING")  # it logs why it waits
     running.wait_for_output(f"{RUNS} 1 rules and 1 restored demands")
     assert chain.wait_task(CARS)["metadata"]["uid"] == task["metadata"]["uid"]
     assert untouched(deployed, chain.deployment(CARS))
@@ -161,7 +161,7 @@ def test_the_intake_file_of_a_killed_detector_replays_up_to_the_truncation(
     chain.wait_events(CARS, "started")
     vehicles.place(CARS, FAR)
     _, ended = chain.wait_events(CARS, "started", "Until")
-    # A kill costs what was taken in in about the last second.
+    # A kill loses about the last second of the intake.
     until = parse_time(ended["data"]["endTime"]) + SECOND
     wait_until(lambda: newest(intake), lambda time: time > until, what="the intake file has the end of the episode")
     running.kill9()
@@ -178,4 +178,4 @@ def newest(intake: Path) -> int:
     try:
         return max((each.received for each in read_intake(intake) if isinstance(each, Arrival)), default=0)
     except RecordingError:
-        return 0  # its beginning is not yet written
+        return 0  # the start of the file is not written yet

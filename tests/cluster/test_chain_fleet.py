@@ -10,7 +10,7 @@ from tests.cluster.chain import CARS, FAR, NEAR, VANS, Chain, Vehicles, detector
 from tests.cluster.processes import Processes
 
 SITES = {"as": "site", "of": [{"name": "north", "y": 0}, {"name": "south", "y": 10_000}]}
-"""Where the cars and the vans drive."""
+"""The sites that the cars and the vans pass."""
 
 
 def fusion() -> Object:
@@ -64,7 +64,7 @@ def seen_at_a_site() -> Object:
 
 
 def wait_sources(api: Api, region: str, sources: list[str]) -> tuple[Object, Object, Object]:
-    """Wait until one task of the region names these sources, and what came of it: its instance and Deployment."""
+    """Wait until one task of the region has these sources; return it with its instance and Deployment."""
 
     def one_with_them(found: Objects) -> bool:
         return [each["spec"]["parameters"].get("sources") for each in of_region(found)] == [sources]
@@ -72,7 +72,7 @@ def wait_sources(api: Api, region: str, sources: list[str]) -> tuple[Object, Obj
     def of_region(found: Objects) -> Objects:
         return [each for each in found if each["spec"]["parameters"]["region"] == region]
 
-    (task,) = of_region(api.wait_list("ApplicationTask", one_with_them, what=f"the task of {region} names {sources}"))
+    (task,) = of_region(api.wait_list("ApplicationTask", one_with_them, what=f"the task of {region} has {sources}"))
     (instance,) = of_region(
         api.wait_list("ApplicationInstance", one_with_them, what=f"the instance of {region} has {sources}")
     )
@@ -82,11 +82,11 @@ def wait_sources(api: Api, region: str, sources: list[str]) -> tuple[Object, Obj
         labels=f"region={region}",
         what=f"the application of {region} receives {sources}",
     )
-    (deployment,) = api.wait_list(  # made after the ConfigMap
+    (deployment,) = api.wait_list(  # created after the ConfigMap
         "Deployment",
         lambda found: len(found) == 1,
         labels=f"region={region}",
-        what=f"the application of {region} is there",
+        what=f"the application of {region} exists",
     )
     return task, instance, deployment
 
@@ -96,7 +96,7 @@ def test_sources_that_come_and_go_reach_the_instance_of_each_site_without_a_rest
 ) -> None:
     chain = Chain(api, namespace, processes, tmp_path / "out")
     unhurried = detector(chain.endpoint)
-    unhurried["spec"]["streams"][0]["staleAfter"] = "Never"  # a vehicle that pauses would leave, and come back
+    unhurried["spec"]["streams"][0]["staleAfter"] = "Never"  # a pausing vehicle would be lost and return
     chain.apply(fusion(), seen_at_a_site(), unhurried)
     chain.start()
     with Vehicles(chain.endpoint) as vehicles:

@@ -42,7 +42,7 @@ def applied(control_plane: ControlPlane, api: Api, tmp_path: Path) -> Iterator[A
 @pytest.fixture
 def large(api: Api) -> Object:
     """A task whose parameters are too large in total for the policy: request it before `applied`."""
-    texts = {f"p{index}": "x" * 60_000 for index in range(10)}  # each is within the bounds of the CRD
+    texts = {f"p{index}": "x" * 60_000 for index in range(10)}  # each is within the limits of the CRD
     return api.create(with_spec(task("before"), parameters=texts))
 
 
@@ -84,7 +84,7 @@ def account(applied: Api, control_plane: ControlPlane) -> Account:
 
 
 def grant(api: Api, name: str, *verbs: str) -> None:
-    """An account with the tasks' and Leases' rights, and these verbs on all Detectors."""
+    """An account with rights to tasks and Leases, and these verbs on all Detectors."""
     rbac = "rbac.authorization.k8s.io"
     rules = [
         {"apiGroups": ["wayside.dev"], "resources": ["applicationtasks"], "verbs": TASKS},
@@ -108,7 +108,7 @@ def held(name: str, holder: str) -> Object:
 
 
 def wait_in_force(api: Api, probe: Api) -> None:
-    """The API server applies a policy, and roles, a moment after they were stored."""
+    """Wait: the API server enforces policies and roles a moment after they are stored."""
 
     def refused() -> str:
         try:
@@ -131,7 +131,7 @@ def test_a_standalone_detector_may_write_only_its_own_tasks_and_its_own_lease(ap
     town = account("town")
     wait_in_force(applied, town)
     applied.create(held("of-harbour", "harbour"))
-    applied.create(task("by-anna"))  # a person's, who is no service account
+    applied.create(task("by-anna"))  # of a user, which is no service account
 
     town.create(held("mine", "town"))
     town.patch("ApplicationTask", "mine", [{"op": "add", "path": "/spec/endTime", "value": "2026-01-01T00:00:00Z"}])
@@ -147,7 +147,7 @@ def test_a_standalone_detector_may_write_only_its_own_tasks_and_its_own_lease(ap
     town.replace(stored)
     refuses("create the Lease wayside-harbour", lambda: town.create(lease("wayside-harbour")))
     refuses("create the Lease application-manager", lambda: town.create(lease("application-manager")))
-    town.create(lease("somebody-elses"))  # no holder's: the roles' matter
+    town.create(lease("somebody-elses"))  # not a holder's Lease: only roles limit it
 
 
 def test_a_task_that_is_too_large_in_total_is_rejected_with_its_field_and_an_existing_one_can_end(

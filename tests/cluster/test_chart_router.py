@@ -1,4 +1,4 @@
-"""The configuration that the chart gives its Zenoh router, taken by a real one: who may do what, by certificates."""
+"""The chart's router configuration in a real Zenoh router: the rights of each client, by its certificate."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Connect = Callable[..., zenoh.Session]
 
 @dataclass(frozen=True)
 class GuardedRouter:
-    """The router's own session, and what connects to it."""
+    """The router's own session, and a function that connects clients to it."""
 
     router: zenoh.Session
     connect: Connect
@@ -57,7 +57,7 @@ def connect(guarded: GuardedRouter) -> Connect:
 
 @pytest.fixture
 def guarded(helm: Helm, tmp_path: Path) -> Iterator[GuardedRouter]:
-    """Connects with a certificate of this name; optionally from another authority, or with none."""
+    """Connects with a certificate for this name, optionally from another authority, or without one."""
     authority, other = Authority(tmp_path), Authority(tmp_path, "foreign")
     certificate, key = authority.sign("router")
     port = free_port()
@@ -106,7 +106,7 @@ def opened(settings: dict[str, Any]) -> zenoh.Session:
 
 def test_each_client_can_do_only_what_it_is_permitted_to(connect: Connect) -> None:
     car, town, anna = connect("car1"), connect("town"), connect("anna")
-    listening = connect("town")  # what one puts itself it gets without the router
+    listening = connect("town")  # a session receives its own puts without the router
     at_town: list[str] = []
     at_anna: list[str] = []
     listening.declare_subscriber("**", lambda sample: at_town.append(f"wide {sample.key_expr}"))
@@ -120,7 +120,7 @@ def test_each_client_can_do_only_what_it_is_permitted_to(connect: Connect) -> No
 
     def arrives() -> bool:
         put(car, "vehicles/car1/pose")
-        put(car, "wayside/events/town/forged")  # beside what arrives, so what follows shows that it did not
+        put(car, "wayside/events/town/forged")  # rejected, in contrast to the puts around it
         put(town, "wayside/events/town/rule")
         put(town, "vehicles/car1/forged")
         return "vehicles/car1/pose" in at_town and "wayside/events/town/rule" in at_anna
@@ -151,7 +151,7 @@ MAY: dict[str, dict[str, set[str]]] = {
     "anna": {"receives": {EVENT}, "queries": {STATUS, "wayside/detectors/other/status"}},
     "stranger": {},
 }
-"""Of all that is tried below everything else is refused. Who may publish on a key may have a token there."""
+"""The router rejects all other attempts below. A client that may publish on a key may also declare a token there."""
 
 KEYS = (
     "vehicles/car1/pose", "vehicles/car2/pose", "vehicles/car1/points", EVENT, STATUS, "wayside/detectors/other/status",
@@ -161,7 +161,7 @@ KEYS = (
 
 @pytest.mark.parametrize("who", MAY)
 def test_each_client_reaches_only_its_own_keys(guarded: GuardedRouter, who: str) -> None:
-    """Watched from within the router, to which no access control applies."""
+    """Observed by the router's own session, which has no access control."""
     inside, session = guarded.router, guarded.connect(who)
     reached: dict[str, set[str]] = {each: set() for each in ("publishes", "token", "receives", "queries", "answers")}
 
@@ -193,7 +193,7 @@ def test_each_client_reaches_only_its_own_keys(guarded: GuardedRouter, who: str)
         )
 
     wait_for(try_all)
-    try_all()  # what is allowed has come by now, and what is not had as much time
+    try_all()  # all permitted messages have arrived; the others had as much time
     expected = {what: MAY[who].get(what, set()) for what in reached}
     assert reached == expected | {"token": expected["publishes"]}
 

@@ -82,7 +82,7 @@ def test_a_chart_is_applied_updated_and_deleted_like_manifests(
     deployment = wait_for_image(api, "app")
     (owner,) = deployment["metadata"]["ownerReferences"]
     assert owner["kind"] == "ApplicationInstance"
-    api.wait_for("ConfigMap", "app-sources", lambda raw: raw["data"]["sources"] == "car1", what="the values are there")
+    api.wait_for("ConfigMap", "app-sources", lambda raw: raw["data"]["sources"] == "car1", what="the values are set")
     api.wait_for(
         "ApplicationInstance", "app", lambda raw: condition(raw, "Ready").get("status") == "True", what="it is ready"
     )
@@ -118,7 +118,7 @@ def test_charts_are_pulled_from_a_repository_and_from_a_registry_and_cached(
             api.create(demand(name, name, "car1"))
             wait_for_image(api, name)
         assert any(each.endswith("first-1.0.0.tgz") for each in requested)
-    # Both are gone now; what was fetched is still here, also after a restart.
+    # Both servers are stopped; the fetched charts are cached, also after a restart.
     manager.restart()
     manager.wait_for_output("watching")
     for name in ("web", "oci"):
@@ -153,12 +153,12 @@ def test_an_unusable_chart_is_rejected_with_a_reason_and_runs_once_corrected(
 
 
 def test_hanging_chart_repositories_delay_no_other_template(api: Api, manager: Process, charts: Path) -> None:
-    """Many templates whose repository takes connections and never answers; and one that is fine, which comes last."""
+    """Many templates whose repository accepts connections but never answers, then one valid template."""
     with silence() as url:
         for number in range(4):
             api.create(template(f"silent-{number}", {"chart": f"c{number}", "version": "1.0.0", "repository": url}))
             api.create(demand(f"silent-{number}", f"silent-{number}", "car1"))
-        api.wait_list("ApplicationInstance", lambda found: len(found) == 4, what="they are all there")
+        api.wait_list("ApplicationInstance", lambda found: len(found) == 4, what="all templates exist")
         api.create(template("app", {"chart": str(write_chart(charts, "app"))}))
         api.create(demand("one", "app", "car1"))
         wait_for_image(api, "app")

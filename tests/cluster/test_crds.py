@@ -94,7 +94,7 @@ def test_an_invalid_object_is_rejected_with_a_helpful_message(
     kind: str, changes: Changes, message: str, control_plane: ControlPlane
 ) -> None:
     with pytest.raises(ApiError, match=rf"(?s){message}") as caught:
-        control_plane.api("default").create(changed(VALID[kind], changes))  # nothing is stored: all share a namespace
+        control_plane.api("default").create(changed(VALID[kind], changes))  # rejected, so all can share a namespace
     assert caught.value.code in (400, 422)
 
 
@@ -216,7 +216,7 @@ class TestServerSideApply:
     def test_applying_an_unchanged_object_changes_nothing(self, api: Api) -> None:
         for kind, manifest in VALID.items():
             name = api.apply(manifest)["metadata"]["name"]
-            # As the manager does. Before, an update stores the default of the status.
+            # As the manager does. First, an update stores the default of the status.
             written = api.patch(kind, name, {"status": {"conditions": []}}, subresource="status")
             assert api.apply(manifest)["metadata"]["resourceVersion"] == written["metadata"]["resourceVersion"]
 
@@ -273,7 +273,7 @@ class TestKubectl:
 
 
 def _covers(stored: Any, written: Any) -> bool:
-    """Whether all that was written is there; defaults may have joined it."""
+    """Whether the stored object has all written fields; it may have defaults too."""
     if isinstance(written, dict):
         return isinstance(stored, dict) and all(
             key in stored and _covers(stored[key], value) for key, value in written.items()
@@ -294,6 +294,6 @@ def _fields(path: str, schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, 
 
 
 def test_kubectl_applies_the_files_as_they_are(control_plane: ControlPlane) -> None:
-    """It reads YAML in its own way: a lone y is a boolean to it."""
+    """kubectl has its own YAML parser: it reads a lone y as a boolean."""
     reported = control_plane.kubectl("apply", "--server-side", "--force-conflicts", "--dry-run=server", "-f", str(CRDS))
     assert len(reported.splitlines()) == len(KINDS)

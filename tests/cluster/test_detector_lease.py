@@ -22,7 +22,7 @@ from tests.patience import PATIENCE
 from wayside.kubernetes.leases import HOLDER_LEASE_LABEL
 
 NAME = "wayside-intersection-a"
-LONG = 600  # s: a Lease that lasts longer than any wait here
+LONG = 600  # s: a Lease that outlasts every wait here
 
 
 class LeaseCandidate:
@@ -44,16 +44,16 @@ class LeaseCandidate:
         wait_until(lambda: self.held, lambda state: state is held, what=f"held is {held}")
 
     def looks(self) -> None:
-        """Wait until it has looked at the Lease as it is from now on."""
+        """Wait until the process has read the Lease again."""
         before = self.lease.attempts
-        wait_until(lambda: self.lease.attempts, lambda n: n >= before + 2, what="it has looked again")
+        wait_until(lambda: self.lease.attempts, lambda n: n >= before + 2, what="it has read the Lease again")
 
     def stop(self) -> None:
         self._loop.loop.call_soon_threadsafe(self.lease.stop)
         self._future.result(PATIENCE)
 
     def die(self) -> None:
-        """As by kill -9: without a release."""
+        """End as by kill -9, without releasing the Lease."""
         self._future.cancel()
         with pytest.raises(CancelledError):
             self._future.result(PATIENCE)
@@ -66,7 +66,7 @@ def loop(control_plane: ControlPlane) -> Iterator[Background]:
 
 
 def renewals(api: Api, count: int) -> list[Object]:
-    """The specs that the Lease has one after the other."""
+    """The successive specs of the Lease."""
     seen: list[Object] = []
 
     def look() -> list[Object]:
@@ -79,7 +79,7 @@ def renewals(api: Api, count: int) -> list[Object]:
 
 
 def another(api: Api, before: Object) -> Object:
-    """The Lease's spec once it is no longer as before."""
+    """The Lease's spec once it differs from `before`."""
     found = api.wait_for("Lease", NAME, lambda lease: lease["spec"] != before, what="the Lease is renewed")
     spec: Object = found["spec"]
     return spec
@@ -116,7 +116,7 @@ def test_the_lease_is_renewed_after_each_third_of_its_duration(api: Api, namespa
 def test_a_manually_deleted_lease_is_recreated(api: Api, namespace: str, loop: Background) -> None:
     LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0).wait_held()
     api.delete("Lease", NAME)
-    api.wait_for("Lease", NAME, lambda _: True, what="the Lease is there again")
+    api.wait_for("Lease", NAME, lambda _: True, what="the Lease exists again")
 
 
 def test_a_second_process_waits_until_the_lease_was_not_renewed_for_its_duration(
@@ -124,7 +124,7 @@ def test_a_second_process_waits_until_the_lease_was_not_renewed_for_its_duration
 ) -> None:
     first = LeaseCandidate(loop, namespace, ProcessIdentity("pod-1"), duration=3.0)
     first.wait_held()
-    clock = [0.0]  # the second one's, in s: how fast this machine is changes nothing
+    clock = [0.0]  # s of the second process, independent of the machine's speed
     second = LeaseCandidate(loop, namespace, ProcessIdentity("pod-2"), duration=3.0, monotonic=lambda: clock[0])
     seen = renewals(api, 1)[-1]
     for _ in range(4):  # for longer than the duration
@@ -135,7 +135,7 @@ def test_a_second_process_waits_until_the_lease_was_not_renewed_for_its_duration
     assert not second.held
     assert "held by pod-1" in caplog.text
     first.die()
-    clock[0] += 2.0  # 2.9 s since the last renewal, if that came before the last look
+    clock[0] += 2.0  # 2.9 s since the last renewal, if it was before the last read
     second.looks()
     assert not second.held
     clock[0] += 3.0
@@ -156,7 +156,7 @@ def test_a_released_lease_is_acquired_at_once_with_the_full_duration(
     api.patch("Lease", NAME, {"metadata": {"labels": {HOLDER_LEASE_LABEL: None, "team": "mobility"}}})
     LeaseCandidate(loop, namespace, ProcessIdentity("pod-2")).wait_held()
     labels = api.get("Lease", NAME)["metadata"]["labels"]
-    assert labels == {HOLDER_LEASE_LABEL: "true", "team": "mobility"}, "as one of an older release gets it"
+    assert labels == {HOLDER_LEASE_LABEL: "true", "team": "mobility"}, "as with a Lease of an older release"
 
 
 def test_the_next_container_of_the_same_pod_takes_over_at_once(namespace: str, loop: Background) -> None:

@@ -73,7 +73,7 @@ def test_selected_rules_are_returned_by_name_and_others_are_not(
     with background(control_plane.kubeconfig) as loop:
         following = RulesFollower(loop, namespace)
         following.wait_rules("a", "c")
-        assert len(following.sets) == 1, "nothing comes before all is known"
+        assert len(following.sets) == 1, "no set before all objects are listed"
 
 
 def test_each_change_of_a_rule_is_followed(api: Api, following: RulesFollower) -> None:
@@ -116,14 +116,14 @@ def test_the_last_known_rules_are_kept_while_the_detector_is_missing(
     before = len(following.sets)
     api.delete("Detector", "intersection-a")
     wait_until(lambda: caplog.text.count("no Detector"), lambda n: n == 2, what="it is logged again")
-    # Only now: Detectors and rules come by two watches, and the rule may be faster.
+    # Only now: Detectors and rules have separate watches, and the rule's may be faster.
     deploy = {"name": "x", "deploy": {"templateName": "t", "parameters": {"not-an-identifier": 1}}}
     api.create(rule("b"))
     api.create(rule("c", actions=[deploy]))
     wait_until(lambda: following.rules.problems, bool, what="the rules that were created meanwhile are known")
     assert len(following.sets) == before
     api.create(detector(clientTimeout="7s"))
-    following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the Detector that is back is followed")
+    following.wait(lambda last: last.detector.spec.client_timeout == "7s", "the recreated Detector is followed")
     assert [names_of(each) for each in following.sets[before:]] == [["a", "b"]]
 
 
@@ -158,4 +158,4 @@ def test_changes_during_an_outage_are_seen_after_it(
     api.delete("EventRule", "a")
     api.create(rule("c"))
     following.wait_rules("b", "c")
-    assert all(set(names_of(each)) & {"a", "b"} for each in following.sets[before:]), "the outage took no rule away"
+    assert all(set(names_of(each)) & {"a", "b"} for each in following.sets[before:]), "the outage removed no rule"

@@ -25,7 +25,7 @@ from tests.patience import PATIENCE
 SECOND = 10**9
 START = 1_767_225_600 * SECOND + 123_456_789
 HOLDER = "intersection-a"
-RARELY = 600.0  # s between two resyncs: what a test sees comes by the watch
+RARELY = 600.0  # s between two resyncs: tests see only the events of the watch
 
 
 def demand(namespace: str, subject: str = "car1+car2", **changes: Any) -> Demand:
@@ -188,7 +188,7 @@ def test_a_manually_deleted_live_task_is_recreated(api: Api, namespace: str, run
         "ApplicationTask",
         wanted.name,
         lambda task: task["metadata"]["uid"] != before["metadata"]["uid"],
-        what="the task is there again",
+        what="the task exists again",
     )
     wait_until(lambda: running.counts, lambda counts: counts.recreated == 1, what="counted as created again")
 
@@ -215,7 +215,7 @@ def test_an_outage_delays_starts_and_ends_but_loses_none(
     before = tasks_are(api, {stays.name, ends.name})
     with control_plane.outage():
         running.update(by_name(stays, passes), {ends.name: START + SECOND})
-        wait_until(lambda: running.counts, lambda c: c.retried > 0, what="the outage was met")
+        wait_until(lambda: running.counts, lambda c: c.retried > 0, what="a write failed in the outage")
         running.update(by_name(stays, starts), {passes.name: START + 2 * SECOND})
     after = tasks_are(api, {stays.name, starts.name}, {ends.name})
     versions = {task["metadata"]["name"]: task["metadata"]["resourceVersion"] for task in before}
@@ -241,7 +241,7 @@ def test_an_end_that_a_stopped_detector_could_not_write_is_written_by_the_next(
         [task] = tasks_are(api, {wanted.name})
         second = BackgroundReconciler(loop, namespace, HOLDER, RARELY)
         assert second.restored() == [wanted]
-        assert not is_ended(api.get("ApplicationTask", wanted.name)), "nothing is ended before the engine has spoken"
+        assert not is_ended(api.get("ApplicationTask", wanted.name)), "tasks end only once the engine has reported"
         second.update({}, {wanted.name: START + 5 * SECOND})
         [ended] = tasks_are(api, set(), {wanted.name})
         second.stop()
@@ -256,7 +256,7 @@ def test_a_detector_that_stops_leaves_its_live_tasks_alive_and_adopts_them(
     with reconciling(control_plane.kubeconfig, namespace) as first:
         first.update(by_name(wanted))
         tasks_are(api, {wanted.name})
-        first.update(by_name(wanted, late))  # and at once stopped: what is due is still done
+        first.update(by_name(wanted, late))  # stopped at once: pending writes are still done
     before = tasks_are(api, {wanted.name, late.name})
     with reconciling(control_plane.kubeconfig, namespace) as second:
         restored = second.restored()
@@ -275,7 +275,7 @@ def test_tasks_of_other_holders_are_left_alone(api: Api, namespace: str, running
     usurped = task_manifest(to_task(wanted))
     usurped["metadata"]["labels"] = {"wayside.dev/holder": "intersection-b"}
     usurped["spec"]["requester"]["holder"] = "intersection-b"
-    disguised = task_manifest(to_task(foreign))  # the label is ours, the requester is not
+    disguised = task_manifest(to_task(foreign))  # this holder's label, but another requester
     disguised["metadata"]["labels"] = {"wayside.dev/holder": HOLDER}
     persons = {
         "apiVersion": "wayside.dev/v1alpha1",

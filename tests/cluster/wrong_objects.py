@@ -1,4 +1,4 @@
-"""What the API server must reject: wrong objects of each kind, with its messages."""
+"""The objects that the API server must reject: wrong objects of each kind, with the messages."""
 
 from __future__ import annotations
 

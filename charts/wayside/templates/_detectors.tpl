@@ -1,5 +1,5 @@
-{{/* The Detectors of the values as {"detectors": […]}, one with regions as one Detector for each region, in whose spec
-{region} stands for the name of the region. */}}
+{{/* The Detectors of the values as {"detectors": […]}, with one Detector for each region of a Detector with regions. In its
+spec, {region} is replaced by the name of the region. */}}
 {{- define "wayside.detectors" -}}
 {{- $found := list -}}
 {{- range $d := .Values.detectors -}}
@@ -21,8 +21,8 @@
 {{- dict "detectors" $found | toJson -}}
 {{- end -}}
 
-{{/* The spec of a Detector of the values: without a mode, and unless run is false, the manager is to run it.
-Of a list: the root, and the Detector. */}}
+{{/* The spec of a Detector of the values: if it has no mode and run is not false, the mode is Standalone.
+The argument is a list: the root and the Detector. */}}
 {{- define "wayside.detectorSpec" -}}
 {{- $root := index . 0 -}}{{- $d := index . 1 -}}
 {{- $spec := deepCopy $d.spec -}}
@@ -33,8 +33,8 @@ Of a list: the root, and the Detector. */}}
 {{- toYaml $spec -}}
 {{- end -}}
 
-{{/* The namespace of an object of the values; it must be one that the manager manages. Of a list: the root, the kind,
-and the object. */}}
+{{/* The namespace of an object of the values; the manager must manage it. The argument is a list: the root, the
+kind and the object. */}}
 {{- define "wayside.lookedAfter" -}}
 {{- $root := index . 0 -}}{{- $object := index . 2 -}}
 {{- $namespace := default $root.Release.Namespace $object.namespace -}}
@@ -52,7 +52,7 @@ app.kubernetes.io/managed-by: application-manager
 wayside.dev/runs: {{ . }}
 {{- end -}}
 
-{{/* Where traces go, and more of OpenTelemetry's variables: by name. */}}
+{{/* The variables of OpenTelemetry by name, such as the endpoint of traces. */}}
 {{- define "wayside.tracing" -}}
 {{- $variables := deepCopy .Values.tracing.variables -}}
 {{- with .Values.tracing.endpoint -}}{{- $_ := set $variables "OTEL_EXPORTER_OTLP_ENDPOINT" . -}}{{- end -}}

@@ -2,7 +2,7 @@
 {{- default .Chart.Name .Values.nameOverride | trunc 63 | trimSuffix "-" -}}
 {{- end -}}
 
-{{/* What all names begin with; short enough for what is put behind it. */}}
+{{/* The prefix of all names, short enough for their suffixes. */}}
 {{- define "wayside.fullname" -}}
 {{- default .Release.Name .Values.fullnameOverride | trunc 40 | trimSuffix "-" -}}
 {{- end -}}
@@ -42,7 +42,7 @@ app.kubernetes.io/part-of: wayside
 {{- end -}}
 {{- end -}}
 
-{{/* Of an image with repository, tag and digest, behind the registry that all images come from. */}}
+{{/* The reference of an image with repository, tag and digest, with the registry of all images as prefix. */}}
 {{- define "wayside.image" -}}
 {{- $repository := .image.repository -}}
 {{- with .Values.imageRegistry -}}{{- $repository = printf "%s/%s" (trimSuffix "/" .) $repository -}}{{- end -}}
@@ -53,7 +53,7 @@ app.kubernetes.io/part-of: wayside
 {{- include "wayside.image" (dict "Values" .Values "image" (dict "repository" .Values.image.repository "digest" .Values.image.digest "tag" (default .Chart.AppVersion .Values.image.tag))) -}}
 {{- end -}}
 
-{{/* Who the program is: by these it owns its Lease, and takes it again after a restart of the container. */}}
+{{/* The program's identity: the holder of its Lease, which it reacquires after a restart of the container. */}}
 {{- define "wayside.podEnvironment" -}}
 - name: POD_NAME
   valueFrom: {fieldRef: {fieldPath: metadata.name}}

@@ -1,4 +1,4 @@
-{{/* The router's configuration, as JSON. A flow is seen from the router: what comes in is ingress. */}}
+{{/* The router's configuration, as JSON. Flows are named from the router's view: incoming messages are ingress. */}}
 {{- define "wayside.routerConfiguration" -}}
 {{- $r := .Values.router -}}
 {{- $endpoint := printf "%s/0.0.0.0:7447" (ternary "tls" "tcp" $r.tls.enabled) -}}
