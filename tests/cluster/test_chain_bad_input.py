@@ -116,7 +116,7 @@ def test_json_of_the_wrong_shape_affects_no_other_client(chain: Chain) -> None:
 
 
 def harms_nobody(chain: Chain, vehicles: Vehicles, bad: Callable[[], bytes], *logged: str) -> None:
-    """One vehicle of another pair sends only bad poses for a while: this is logged, and the pair's episode stays open."""
+    """One vehicle of another pair sends only bad poses for a while: this is logged, and that episode stays open."""
     running = chain.start()
     with unharmed(chain, vehicles, running):
         vehicles.place(VANS, NEAR)
