@@ -75,7 +75,7 @@ def wait_for_pod(api: Api) -> Object:
 
 
 def wait_until_announced(api: Api, *sources: str) -> Object:
-    """Wait until the pod's annotation stands for the configuration with these sources; return the pod."""
+    """Wait until the pod's annotation matches the configuration with these sources; return the pod."""
     wait_for_sources(api, *sources)
     content = fingerprint(api.get("ConfigMap", CONFIG_MAP)["data"])
     (pod,) = api.wait_list(
@@ -132,7 +132,7 @@ def test_a_configuration_change_annotates_the_pods_and_leaves_their_template_alo
 
 
 def test_foreign_pods_with_the_same_labels_are_left_alone(api: Api, manager: Process) -> None:
-    """A pod with the very labels of the instance's, which does not mount its configuration."""
+    """A pod that has the same labels as the instance's pod but does not mount its configuration."""
     api.create(template())
     api.create(
         {
@@ -182,12 +182,12 @@ def test_a_restarted_manager_answers_queries_again(
     key = f"wayside/instances/{namespace}/fusion/configuration"
     api.create(template())
     api.create(vehicle("car1"))
-    wait_until(lambda: requested(network, key), lambda found: found == [["car1"]], what="there is an answer")
+    wait_until(lambda: requested(network, key), lambda found: found == [["car1"]], what="the query has an answer")
     manager.kill9()
     api.create(vehicle("car2"))
     manager.restart()
     wait_until(
-        lambda: requested(network, key), lambda found: found == [["car1", "car2"]], what="there is an answer again"
+        lambda: requested(network, key), lambda found: found == [["car1", "car2"]], what="the query has an answer again"
     )
     wait_until_announced(api, "car1", "car2")
 
@@ -197,12 +197,14 @@ def test_the_zenoh_router_may_start_late_and_stop(api: Api, namespace: str, endp
     api.create(template())
     api.create(vehicle("car1"))
     wait_for_sources(api, "car1")
-    wait_settled(api)  # without a network everything else continues
+    wait_settled(api)  # everything else continues without a network
     for number in (2, 3):
         with router(listen__endpoints=[endpoint]) as session:
             cars = [f"car{each}" for each in range(1, number)]
             wait_until(
-                lambda: requested(session, key), lambda found, cars=cars: found == [cars], what="there is an answer"
+                lambda: requested(session, key),
+                lambda found, cars=cars: found == [cars],
+                what="the query has an answer",
             )
             reported = SourcesSubscriber(session, key)
             api.create(vehicle(f"car{number}"))
@@ -240,7 +242,7 @@ class Mount:
             self.sync(api)
             return sources_in((self.folder / "sources.yaml").read_text())
 
-        wait_until(look, lambda found: found == [*sources], what=f"the kubelet syncs, and brings {sources}")
+        wait_until(look, lambda found: found == [*sources], what=f"the kubelet syncs the files with {sources}")
 
 
 @pytest.mark.parametrize("way", ["zenoh", "file"])
@@ -261,7 +263,7 @@ def test_the_example_follows_its_sources(
     if way == "file":
         mount.wait_for(api, "car1", "car2")
     application.wait_for_output(f"following car1, car2 .by {way}.")
-    # Its subscription takes a moment to reach us.
+    # Its subscription reaches this session after a moment.
     with repeated("vehicle", lambda: network.put("vehicles/car2/pose", "here"), 0.1):
         application.wait_for_output("vehicles/car2/pose: here")
     end(api, "car1")

@@ -11,12 +11,14 @@ from tests.cluster.processes import Processes
 def test_an_unlisted_account_is_rejected_in_a_kind_unknown_to_the_manager(
     api: Api, processes: Processes, namespace: str
 ) -> None:
-    """ReplicaSets are not of the default kinds; what an administrator adds is looked at all the same."""
+    """ReplicaSets are not among the default kinds; kinds that an administrator adds are checked too."""
     start_manager(processes, namespace, "--allowed-kinds", "apps/v1/ReplicaSet")
     made = deployment() | {"kind": "ReplicaSet"}
     api.create(template("fine", manifests=[made]))
     api.create(task("north", of="fine"))
-    running = api.wait_for("ReplicaSet", instance_name("fine", "north"), lambda _: True, what="one without is made")
+    running = api.wait_for(
+        "ReplicaSet", instance_name("fine", "north"), lambda _: True, what="one without an account is created"
+    )
     assert running["spec"]["template"]["spec"]["automountServiceAccountToken"] is False
 
     made["spec"]["template"]["spec"]["serviceAccountName"] = "admin"
@@ -25,7 +27,7 @@ def test_an_unlisted_account_is_rejected_in_a_kind_unknown_to_the_manager(
         "ApplicationTemplate",
         "bad",
         lambda raw: condition(raw, "Accepted").get("status") == "False",
-        what="the account is refused",
+        what="the account is rejected",
     )
     message = condition(refused, "Accepted")["message"]
     for part in ("spec.manifests[0].spec.template.spec.serviceAccountName", "'admin'", "use one of default"):

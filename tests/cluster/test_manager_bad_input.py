@@ -13,14 +13,14 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import condition, config, deployment, start_manager, task, template, wait_settled
 from tests.cluster.processes import Process, Processes, environment_of
 
-pytestmark = pytest.mark.own_control_plane  # the manager here serves all namespaces
+pytestmark = pytest.mark.own_control_plane  # this manager serves all namespaces
 
 BAD = instance_name("bad", "north")
 
 
 @pytest.fixture(scope="module")
 def manager(own_control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    """One for all these tests and their namespaces: that it survives each of them is part of what they show."""
+    """One manager for all these tests and their namespaces, so they also show that it survives each of them."""
     processes = Processes(tmp_path_factory.mktemp("logs"), environment_of(own_control_plane.kubeconfig))
     yield start_manager(processes)
     processes.kill_all()
@@ -28,14 +28,14 @@ def manager(own_control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture
 def unharmed(api: Api, manager: Process) -> Iterator[None]:
-    """Something runs beside, and is as it was in the end; a task that comes later is served as well."""
+    """Another application runs during the block and is unchanged afterwards; a later task is served as well."""
     api.create(template("good"))
     api.create(task("before", of="good"))
     name = instance_name("good", "before")
-    first = api.wait_for("Deployment", name, lambda _: True, what="the good one runs")["metadata"]
+    first = api.wait_for("Deployment", name, lambda _: True, what="the good application runs")["metadata"]
     yield
     api.create(task("after", of="good"))
-    api.wait_for("Deployment", instance_name("good", "after"), lambda _: True, what="a later one runs")
+    api.wait_for("Deployment", instance_name("good", "after"), lambda _: True, what="a later application runs")
     wait_settled(api, refused=[BAD])
     last = api.get("Deployment", name)["metadata"]
     assert (last["uid"], last["generation"]) == (first["uid"], first["generation"])
@@ -151,7 +151,7 @@ def test_an_invalid_template_keeps_running_applications_until_it_is_valid(api: A
     api.create(task("north", of="bad"))
     first = api.wait_for("Deployment", BAD, lambda _: True, what="the Deployment exists")["metadata"]
     wait_settled(api)
-    # To the API server any default is fine, the manager knows better.
+    # The API server accepts any default; the manager rejects this one.
     wrong = {"parameters": {"region": {"type": "string", "required": True}, "rate": {"type": "number", "default": "x"}}}
     api.patch("ApplicationTemplate", "bad", {"spec": wrong})
     refused = wait_for_false(api, "ApplicationTask", "north", "Accepted", ["'x' is not of type number"])

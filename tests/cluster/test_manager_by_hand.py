@@ -53,7 +53,7 @@ def test_a_paused_instance_is_not_changed_until_the_annotation_is_removed(api: A
     end(api, "one")
     end(api, "two")
     api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="no demand is left"
+        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="all demands have ended"
     )
     manager.restart()
     manager.wait_for_output("watching")
@@ -63,7 +63,7 @@ def test_a_paused_instance_is_not_changed_until_the_annotation_is_removed(api: A
 
     api.create(task("three", region="north", zones=["c"]))
     annotate(api, "pause", None)
-    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["c"]!', what="the values are in again")
+    api.wait_for("ConfigMap", NORTH, lambda raw: raw["data"]["z"] == '["c"]!', what="the values are applied again")
     wait_condition(api, "Paused", "False")
     wait_condition(api, "Applied", "True", "ApplicationTask", "three")
     wait_settled(api)
@@ -77,7 +77,7 @@ def test_a_held_instance_keeps_running_without_demand(api: Api, manager: Process
     wait_condition(api, "Held", "True")
     end(api, "north")
     api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="no demand is left"
+        "ApplicationInstance", NORTH, lambda raw: raw["status"]["demands"]["count"] == 0, what="all demands have ended"
     )
     manager.restart()
     manager.wait_for_output("watching")

@@ -91,7 +91,7 @@ def is_made(api: Api) -> None:
 
 
 def copied(labels: dict[str, str], name: str, kind: str = "Deployment") -> Object:
-    """An object of somebody else with all labels of a detector's, whose pods crash."""
+    """An object of another owner that has all labels of a detector's object, and whose pods crash."""
     pod = {
         "metadata": {"labels": labels},
         "spec": {"containers": [{"name": "main", "image": "other:1"}]},
@@ -107,7 +107,7 @@ def test_a_foreign_object_with_copied_labels_is_ignored_and_left_alone(
     api.create(detector(mode="Standalone"))
     is_made(api)
     labels = api.get("Deployment", NAME)["metadata"]["labels"]
-    # Listed before and after the detector's own.
+    # Their names sort before and after the detector's own.
     others = [api.create(copied(labels, each))["metadata"]["name"] for each in (f"{NAME[:-1]}a", f"{NAME}-other")]
     own = api.wait_list(
         "Pod",
@@ -122,7 +122,7 @@ def test_a_foreign_object_with_copied_labels_is_ignored_and_left_alone(
         status = {"name": "main", "image": "other:1", "imageID": "", "ready": False, "restartCount": 0, "state": state}
         api.patch("Pod", each["metadata"]["name"], {"status": {"containerStatuses": [status]}}, subresource="status")
 
-    manager.restart()  # it knows nothing but what it finds
+    manager.restart()  # it has only the listed objects
     manager.wait_for_output("watching")
     for seconds in ("30s", "20s"):
         api.patch("Detector", HOLDER, {"spec": {"clientTimeout": seconds}})
@@ -193,7 +193,7 @@ def test_the_status_reports_why_the_detector_does_not_run(api: Api, processes: P
     api.delete("ServiceAccount", NAME)
     is_made(api)
     shows(api, "False", "NotReady")
-    (pod,) = api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
+    (pod,) = api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is created")
     waiting = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
     state = {"name": "detector", "image": "wayside:1", "imageID": "", "ready": False, "restartCount": 0}
     status = {"phase": "Pending", "containerStatuses": [{**state, "state": waiting}]}
@@ -215,7 +215,7 @@ def test_the_pod_passes_the_restricted_standard(
     mounts = [{"name": "data", "mountPath": "/data"}]
     pod = {"volumes": volumes, "volumeMounts": mounts, "secretNames": ["pager"]}
     api.create(detector(mode="Standalone", pod=pod, **paths))
-    api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is made")
+    api.wait_list("Pod", lambda found: len(found) == 1, what="its pod is created")
 
 
 def test_the_printed_rights_suffice_to_run_a_detector(
@@ -267,9 +267,9 @@ def test_a_detector_needs_exactly_the_rights_of_its_role(
         running = run_detector(processes, namespace, kubeconfig)
         with Vehicles(endpoint) as vehicles:
             vehicles.place(CARS, NEAR)
-            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="there is a task")
+            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="a task exists")
             api.delete("ApplicationTask", task["metadata"]["name"])
-            api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="the task is there again")
+            api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="the task exists again")
             vehicles.place(CARS, FAR)
             api.wait_list("ApplicationTask", lambda found: bool(found) and not live(found), what="the task has ended")
         renewed = api.get("Lease", f"wayside-{HOLDER}")["spec"]["renewTime"]

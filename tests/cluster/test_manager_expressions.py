@@ -19,7 +19,7 @@ from tests.worker_jobs import TEXT
 
 LIMIT = ("--expression-cpu-time", "500ms")
 BOMB = 'parameters.l.filter(x, parameters.s.matches("([ab]*a[ab]{50}){3}z")).size()'
-"""Takes some 15 ms for each item, in C++ and with the interpreter's lock held."""
+"""Takes about 15 ms for each item, in C++, while it holds the GIL."""
 
 PARAMETERS = {
     "region": {"type": "string", "default": "north"},
@@ -31,12 +31,12 @@ LARGE = {"l": [str(index) for index in range(2000)], "s": TEXT}
 
 
 def bomb(name: str = "bomb", *, key: str = "${parameters.region}", **spec: Any) -> Object:
-    """A template that is in order with small values, and takes half a minute to render with large ones."""
+    """A template that renders fast with small values, and takes half a minute with large ones."""
     return template(name, parameters=PARAMETERS, key=key, manifests=[config({"n": f"n=${{{BOMB}}}"})], **spec)
 
 
 def accepted(api: Api, name: str, status: str) -> str:
-    """The message in the template's status, once its condition Accepted is so."""
+    """The message of the template's condition Accepted, once it has this status."""
     found = api.wait_for(
         "ApplicationTemplate",
         name,
@@ -48,7 +48,7 @@ def accepted(api: Api, name: str, status: str) -> str:
 
 
 def applied(api: Api, name: str, reason: str) -> Object:
-    """The instance, once its condition Applied has the reason."""
+    """The instance, once its condition Applied has this reason."""
     return api.wait_for(
         "ApplicationInstance",
         name,
@@ -109,7 +109,7 @@ def test_a_key_that_times_out_rejects_only_its_task(api: Api, namespace: str, pr
         "ApplicationTask",
         "bad",
         lambda raw: condition(raw, "Accepted").get("reason") == "ExpressionLimit",
-        what="the task with the large values is refused",
+        what="the task with the large values is rejected",
     )
     assert "took more than 0.5 s of CPU time" in condition(refused, "Accepted")["message"]
     south = f"{instance_name('bomb', 'south-0')}-config"
@@ -143,7 +143,7 @@ def test_a_manager_stopped_during_a_long_evaluation_ends_at_once_and_leaves_no_p
     api.create(bomb())
     accepted(api, "bomb", "True")
     (worker,) = children(manager.pid)
-    assert os.sched_getscheduler(worker) == os.SCHED_OTHER, "in tests it does not wait for an idle machine"
+    assert os.sched_getscheduler(worker) == os.SCHED_OTHER, "workers of tests do not run in the idle class"
     api.create(task("bad", of="bomb", region="north", **LARGE))
     api.wait_for("ApplicationTask", "bad", lambda _: True, what="the task exists")
     assert manager.terminate() == 0
@@ -151,7 +151,7 @@ def test_a_manager_stopped_during_a_long_evaluation_ends_at_once_and_leaves_no_p
 
 
 def children(pid: int) -> list[int]:
-    """The processes that a process has started."""
+    """The child processes of a process."""
     return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 

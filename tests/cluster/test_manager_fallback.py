@@ -22,7 +22,7 @@ def wait_accepted(api: Api, name: str, reason: str) -> Object:
 
 
 def wait_condition(api: Api, instance: str, type_: str, status: str, shows: str = "") -> Object:
-    """Wait for the condition, whose message may follow its status, and both the task's; return it."""
+    """Wait until the instance's condition has this status and its message contains `shows`; return it."""
 
     def holds(raw: Object) -> bool:
         found = condition(raw, type_)
@@ -59,7 +59,7 @@ def test_an_instance_that_is_not_ready_in_time_reports_it(api: Api, processes: P
     )
     become_ready(api, FULL)
     api.wait_for(
-        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="it is served after all"
+        "ApplicationTask", "north", lambda raw: raw["status"]["phase"] == "Ready", what="it is served eventually"
     )
     assert wait_condition(api, FULL, "TimedOut", "False")["reason"] == "InTime"
 
@@ -87,7 +87,7 @@ def test_the_fallback_serves_until_the_primary_is_ready_across_restarts(
     api.create(task("second", region="north"))
     wait_accepted(api, "second", "FallenBack")
     wait_settled(api)
-    assert api.get("ApplicationInstance", LITE)["metadata"]["uid"] == uid  # though it lingers for no time at all
+    assert api.get("ApplicationInstance", LITE)["metadata"]["uid"] == uid  # although it has no linger
 
     become_ready(api, FULL)
     manager.kill9()

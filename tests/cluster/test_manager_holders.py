@@ -21,15 +21,15 @@ NORTH = instance_name("app", "north")
 LOST = {"det": LeaseView(1000.0)}
 
 
-LONG = 600  # s: for as long as the test looks
-SHORT = 10  # s: to be waited for, and long beside the half second of the renewals
+LONG = 600  # s: outlasts the test
+SHORT = 10  # s: short enough to wait for, long compared with the half second between renewals
 
 
 @pytest.fixture
 def renew(api: Api) -> Callable[..., None]:
     """Renews the Lease of a holder, by default `det`, for a number of seconds; that of `det` begins with a long one.
 
-    That of `old` has no label, as those of detectors of older releases.
+    The Lease of `old` has no label, like those of detectors of older releases.
     """
     minutes = itertools.count()
 
@@ -37,7 +37,7 @@ def renew(api: Api) -> Callable[..., None]:
         spec = {
             "holderIdentity": holder,
             "leaseDurationSeconds": duration,
-            "renewTime": "2020-01-01T{:02}:{:02}:00.000000Z".format(*divmod(next(minutes), 60)),  # a clock far behind
+            "renewTime": "2020-01-01T{:02}:{:02}:00.000000Z".format(*divmod(next(minutes), 60)),  # its clock is behind
         }
         metadata: Object = {"name": f"wayside-{holder}"}
         if holder != "old":
@@ -69,16 +69,16 @@ def test_the_demand_of_a_lost_holder_is_released_and_counts_again_when_it_return
     assert lost["status"]["phase"] == "Lapsed"
     api.wait_gone("Deployment", NORTH)
     wait_settled(api, lost=LOST)
-    assert len(api.list("Deployment")) == 1, "a person's task never expires"
+    assert len(api.list("Deployment")) == 1, "a user's task never expires"
 
-    manager.kill9()  # the loss is remembered: a new manager has not observed anything, and yet starts nothing
+    manager.kill9()  # the loss is stored: a new manager has not observed any Lease, but starts nothing
     manager.start()
     manager.wait_for_output("watching")
     wait_settled(api, lost=LOST)
     assert api.find("Deployment", NORTH) is None
 
     def again() -> Any:
-        renew(LONG)  # as a holder does all the time: the first that the new manager sees of a Lease is no renewal to it
+        renew(LONG)  # repeatedly: the first Lease that the new manager reads is not a renewal to it
         return api.find("Deployment", NORTH)
 
     wait_until(again, bool, what="the demand counts again")
@@ -91,7 +91,7 @@ def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, re
     renew(LONG, "old")
     for holder in ("det", "old", "silent", "nobody"):
         api.create(task(holder, holder=holder))
-        # There is patience with one that has no Lease: for 15 s, and one more.
+        # A holder without a Lease is lost only after 15 s and one more.
         api.wait_for("ApplicationTask", holder, lambda raw: reason(raw) == "Accepted", what="it counts")
     name = instance_name("app", "det")
     uid = api.wait_for("Deployment", name, lambda _: True, what="the Deployment exists")["metadata"]["uid"]
@@ -101,7 +101,7 @@ def test_a_lease_that_is_renewed_keeps_the_demand(api: Api, manager: Process, re
         renew(SHORT, "old")
 
     with repeated("renewing", renew_both, 0.5):
-        renew(SHORT, "silent")  # for the last time
+        renew(SHORT, "silent")  # the last renewal
         api.wait_for("ApplicationTask", "silent", lambda raw: reason(raw) == "HolderLost", what="it is lost")
         for holder in ("det", "old"):
             assert reason(api.get("ApplicationTask", holder)) == "Accepted"

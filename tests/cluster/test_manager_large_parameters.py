@@ -25,7 +25,7 @@ def test_a_union_that_is_too_large_stops_updates_of_its_own_instance_only(api: A
     manifests = [deployment(), config({"sources": "${parameters.sources}!"})]
     api.create(template(parameters=parameters, manifests=manifests))
     api.create(task("small", region="north", sources=["car1"]))
-    api.wait_for("ConfigMap", CONFIG, lambda raw: raw["data"]["sources"] == '["car1"]!', what="the first one runs")
+    api.wait_for("ConfigMap", CONFIG, lambda raw: raw["data"]["sources"] == '["car1"]!', what="the first instance runs")
     for name, count in (("large", 40), ("larger", 50)):
         api.create(task(name, region="north", sources=sources(name[-1], count)))
     instance = api.wait_for("ApplicationInstance", NORTH, too_large, what="the instance reports why it is unchanged")
@@ -33,12 +33,12 @@ def test_a_union_that_is_too_large_stops_updates_of_its_own_instance_only(api: A
     assert reported["reason"] == "ParametersTooLarge"
     assert "task larger gives 50" in reported["message"]
     assert reported["message"].index("task larger") < reported["message"].index("task large gives")
-    waiting = api.wait_for("ApplicationTask", "larger", too_large, what="so does the task")
+    waiting = api.wait_for("ApplicationTask", "larger", too_large, what="the task reports it too")
     assert waiting["status"]["phase"] == "Pending"
 
     api.create(task("elsewhere", region="south", sources=["car2"]))
-    api.wait_for("Deployment", SOUTH, lambda _: True, what="another instance of the template is made")
-    for name in ("first", "second"):  # an instance that would be too large from its beginning
+    api.wait_for("Deployment", SOUTH, lambda _: True, what="another instance of the template is created")
+    for name in ("first", "second"):  # an instance that would be too large from the start
         api.create(task(name, region="west", sources=sources(name[0], 40)))
     api.wait_for("ApplicationTask", "second", too_large, what="the second one reports that both are too large")
 

@@ -40,12 +40,12 @@ def wait_task(api: Api, name: str, phase: str, reason: str = "Accepted") -> Obje
 
 
 def wait_instance(api: Api, name: str, holds: Callable[[Object], bool], what: str) -> Object:
-    """Wait until it is so of the instance, whose status is written beside that of its tasks; return it."""
+    """Wait until `holds` is true for the instance, whose status is written separately from its tasks'; return it."""
     return api.wait_for("ApplicationInstance", name, holds, what=f"instance {name} {what}")
 
 
 def wait_event(api: Api, reason: str) -> None:
-    """Wait for an Event of this reason: they are posted in the background, and a manager that is killed posts none."""
+    """Wait for an Event with this reason: Events are posted in the background, and a killed manager posts none."""
     api.wait_list(
         "Event", lambda found: reason in {each["reason"] for each in found}, what=f"an Event {reason} is posted"
     )
@@ -53,7 +53,7 @@ def wait_event(api: Api, reason: str) -> None:
 
 @contextmanager
 def never_more_than(api: Api, count: int) -> Iterator[None]:
-    """Look all the time how many instances there are; fail in the end if there were ever more."""
+    """Count the instances continuously; fail at the end of the block if there were ever more than `count`."""
     most = 0
 
     def look() -> None:
@@ -105,7 +105,7 @@ def test_the_namespace_limit_covers_all_templates(api: Api, processes: Processes
         api.create(wanting("c", of="map"))
         waiting = wait_task(api, "c", "Waiting", "LimitReached")
         assert "the namespace is at its limit of 2 instances" in waiting["status"]["message"]
-        end(api, "a")  # of another template; what lingers yields
+        end(api, "a")  # of another template; lingering instances yield
         wait_task(api, "c", "Active")
         wait_settled(api, limit=2)
 
@@ -140,13 +140,13 @@ def wait_enforced(api: Api) -> None:
 
 
 def raise_quota(api: Api, hard: dict[str, str]) -> None:
-    """Raise it, and wait until that counts: admission goes by the status, which a controller writes later."""
+    """Raise the quota and wait until it applies: admission reads the status, which a controller writes later."""
     api.patch("ResourceQuota", "few", {"spec": {"hard": hard}})
     api.wait_for("ResourceQuota", "few", lambda raw: raw["status"]["hard"] == hard, what="the raised quota holds")
 
 
 def beyond_the_quota(api: Api, name: str) -> Object:
-    """The task of this name, once it reports what it waits for."""
+    """The task of this name, once it reports that it waits for the quota."""
     return api.wait_for(
         "ApplicationTask",
         name,
@@ -241,7 +241,7 @@ def test_a_rejection_by_a_limit_range_is_reported_too(api: Api, processes: Proce
     )
     assert "maximum storage usage per PersistentVolumeClaim is 1Gi" in reported["status"]["message"]
     api.patch("LimitRange", "small", {"spec": {"limits": [{**most, "max": {"storage": "2Gi"}}]}})
-    api.wait_for("PersistentVolumeClaim", LOW, lambda raw: True, what="the claim is made")
+    api.wait_for("PersistentVolumeClaim", LOW, lambda raw: True, what="the claim is created")
 
 
 def test_lowering_and_raising_a_limit_stops_and_starts_the_last_instance(
@@ -280,26 +280,26 @@ def test_pod_rejections_known_only_from_events_are_reported_and_resolved_once_th
     )
     ready = condition(logged, "Ready")
     assert ready["status"] == "False"
-    assert 'pods "' not in ready["message"]  # the name is another one each time
+    assert 'pods "' not in ready["message"]  # the name differs each time
     raise_quota(api, {"pods": "2"})
     changes = itertools.count()
 
     def pods() -> Objects:
-        # A controller looks at what changes, and the API server may learn of the quota only after that.
+        # A controller reconciles on changes, and the API server may see the new quota only after that.
         api.patch(kind, LOW, {"metadata": {"annotations": {"changed": str(next(changes))}}})
         return api.list("Pod")
 
-    wait_until(pods, bool, what="there is a pod")
+    wait_until(pods, bool, what="a pod exists")
     api.wait_for(
         "ApplicationInstance",
         LOW,
         lambda raw: condition(raw, "Ready")["reason"] != "QuotaExceeded",
-        what="it is not reported any more",
+        what="it is no longer reported",
     )
 
 
 def workload(kind: str) -> Object:
-    """One of that kind, with one pod."""
+    """A workload of this kind, with one pod."""
     pod: Object = {"spec": {"containers": [{"name": "main", "image": "app:1"}]}}
     made: Object = {"kind": kind, "metadata": {"name": "${instance.name}"}}
     if kind == "Job":

@@ -1,6 +1,6 @@
 """The manager reads from the API server before it stops anything, since its cache may be incomplete.
 
-The manager's parts run in the test itself here, since a hole in what a process knows cannot be made from outside.
+The manager's parts run in the test process, since a test cannot remove objects from another process's cache.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NORTH = instance_name("app", "north")
 
 
 def ignore(*_: object) -> None:
-    """Stands for the queues, which do not run here."""
+    """Replaces the queues, which do not run here."""
 
 
 def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
@@ -59,7 +59,7 @@ def work_on(cache: ClusterCache, client: Client) -> tuple[Router, InstanceWork]:
 
 
 def reconcile(api: Api, known: list[Object]) -> None:
-    """Reconcile the instance once, knowing only these objects."""
+    """Reconcile the instance once, with only these objects in the cache."""
 
     async def run() -> None:
         client = manager_client(await load_configuration())
@@ -75,7 +75,7 @@ def reconcile(api: Api, known: list[Object]) -> None:
 
 
 def lingering(api: Api) -> list[Object]:
-    """A template, and an instance whose linger is over, as the API server has them."""
+    """A template, and an instance whose linger has ended, as stored at the API server."""
     made = api.create(template())
     managed = {"app.kubernetes.io/managed-by": "wayside"}
     api.create(

@@ -13,10 +13,10 @@ from tests.cluster.processes import Process, Processes
 
 MIB = 1024 * 1024
 MANY, VALUES, ITEMS = 20, 28, 4000
-"""Tasks, their values and the items of each: the API server takes no more than 4,096 in one."""
+"""The number of tasks, of their values and of the items in each: the API server accepts at most 4,096 items."""
 
 GROWTH = 70 * MIB
-"""Memory that these tasks of 1 MB may take. With all their values in memory they take 140 MiB at the least."""
+"""The memory that these tasks of 1 MB may take. With all values in memory, they take at least 140 MiB."""
 
 
 def event(values: dict[str, Any]) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def test_while_the_api_server_is_away_the_manager_is_healthy_but_not_ready(
     wait_until(lambda: get(port, "/readyz")[0], lambda code: code == 200, what="it is ready")
     control_plane.stop_api_server()
     away = (503, "the API server does not respond\n")
-    wait_until(lambda: get(port, "/readyz"), away.__eq__, what="it is not ready, and reports why")
+    wait_until(lambda: get(port, "/readyz"), away.__eq__, what="it is not ready and reports the reason")
     assert get(port, "/healthz")[0] == 200
     control_plane.recover()
     wait_until(lambda: get(port, "/readyz")[0], lambda code: code == 200, what="it is ready again")

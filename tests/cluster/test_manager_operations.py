@@ -32,7 +32,7 @@ def rated(**spec: Any) -> Object:
 
 
 def freely_scaled(**spec: Any) -> Object:
-    """A template that leaves the number of replicas to others."""
+    """A template that does not set the number of replicas."""
     manifest = deployment()
     del manifest["spec"]["replicas"]
     return template(manifests=[manifest], **spec)
@@ -96,7 +96,7 @@ def test_a_reconfiguration_waits_overrides_the_values_and_is_reverted(api: Api, 
     wait_rate(api, NORTH, 30)
     wait_phase(api, "slow", "Finished")
     wait_settled(api)
-    assert api.get("Deployment", NORTH)["metadata"]["generation"] == before["generation"]  # no rollout by all this
+    assert api.get("Deployment", NORTH)["metadata"]["generation"] == before["generation"]  # no rollout happened
 
 
 def test_a_reconfiguration_without_a_key_covers_existing_and_new_instances(api: Api, manager: Process) -> None:
@@ -139,7 +139,7 @@ def test_a_suspended_instance_has_zero_replicas_and_resumes_with_its_former_numb
     wait_phase(api, "night", "Ready")
     wait_settled(api)
 
-    scale(api, NORTH, 2)  # somebody starts it by hand
+    scale(api, NORTH, 2)  # a user starts it manually
     wait_replicas(api, NORTH, 0)
     end(api, "night")
     wait_replicas(api, NORTH, 3)
@@ -173,7 +173,7 @@ def test_an_instance_created_while_suspended_never_has_a_pod(api: Api, manager: 
     wait_phase(api, "night", "Waiting")
     api.create(task("north"))
     wait_suspended(api, NORTH, "True")
-    assert api.get("Deployment", NORTH)["metadata"]["generation"] == 1  # it never had another number of replicas
+    assert api.get("Deployment", NORTH)["metadata"]["generation"] == 1  # its number of replicas never changed
     end(api, "night")
     wait_replicas(api, NORTH, 1)
     wait_settled(api)
@@ -229,7 +229,7 @@ def test_an_autoscaled_workload_is_paused_and_resumes_with_its_replicas(api: Api
             ],
         },
     }
-    api.create(template(manifests=[deployment(), autoscaler]))  # its Deployment has 1: the autoscaler's value counts
+    api.create(template(manifests=[deployment(), autoscaler]))  # the manifest has 1: the autoscaler's value applies
     api.create(task("north"))
     wait_replicas(api, NORTH, 3)
     wait_settled(api)
@@ -239,7 +239,7 @@ def test_an_autoscaled_workload_is_paused_and_resumes_with_its_replicas(api: Api
     api.wait_for(
         *rests,
         lambda raw: condition(raw, "ScalingActive").get("reason") == "ScalingDisabled",
-        what="the autoscaler has seen that its target is at zero, and leaves it there",
+        what="the autoscaler has seen that its target is at zero and is inactive",
     )
     wait_replicas(api, NORTH, 0)
     instance = wait_suspended(api, NORTH, "True")

@@ -12,11 +12,11 @@ from tests.cluster.faulty_proxy import Proxy, faulty_proxy
 from tests.cluster.processes import Processes
 
 OTHER = ("--lease", "other", "--allowed-kinds", "v1/ConfigMap")
-"""Of the second release: to it, a template with a Deployment is invalid."""
+"""Options of the second release, which rejects a template with a Deployment."""
 
 WAITS = r"also managed by the manager of the Lease \S+/application-manager, which is older: this manager stands by"
 ATTEMPTS, EVERY = 10, 5.0
-"""Writes of the second one that may be seen while a task is served: attempts, and another one in these seconds."""
+"""The maximum number of writes of the second manager: ATTEMPTS, and one more every EVERY seconds."""
 
 
 def statuses(proxy: Proxy) -> int:
@@ -32,7 +32,7 @@ def test_the_younger_release_waits_until_the_older_one_stops(
     ):
         older = start_manager(processes, namespace, kubeconfig=one)
         older.wait_for_output("active: holds the Lease")
-        api.wait_for("Lease", "application-manager", lambda _: True, what="the first Lease is there")
+        api.wait_for("Lease", "application-manager", lambda _: True, what="the first Lease exists")
         younger = start_manager(processes, namespace, *OTHER, kubeconfig=two)
         younger.wait_for_output("active: holds the Lease")
         began = time.monotonic()
@@ -41,13 +41,13 @@ def test_the_younger_release_waits_until_the_older_one_stops(
         for number in range(3):
             api.create(task(f"t{number}"))
             name = instance_name("app", f"t{number}")
-            api.wait_for("Deployment", name, lambda _: True, what="the first one serves the task")
+            api.wait_for("Deployment", name, lambda _: True, what="the first manager serves the task")
         wait_settled(api)
         reported = api.wait_for(
             "ApplicationTemplate",
             "app",
             lambda raw: raw["status"].get("manager", {}).get("lease", "").endswith("/application-manager"),
-            what="its status names the older one",
+            what="its status names the older manager",
         )
         assert condition(reported, "Accepted")["status"] == "True"
         attempts = ATTEMPTS + (time.monotonic() - began) / EVERY
@@ -61,6 +61,6 @@ def test_the_younger_release_waits_until_the_older_one_stops(
             "ApplicationTemplate",
             "app",
             lambda raw: condition(raw, "Accepted")["status"] == "False",
-            what="the second one judges the template",
+            what="the second manager validates the template",
         )
         assert api.find("Deployment", instance_name("app", "t0")) is not None, "what runs stays"

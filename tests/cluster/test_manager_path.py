@@ -1,4 +1,4 @@
-"""From a task to a running workload and back, by the manager as a process beside a real API server."""
+"""From a task to a running workload and back, with the manager as a process and a real API server."""
 
 from __future__ import annotations
 
@@ -83,11 +83,14 @@ def test_a_new_demand_within_the_linger_keeps_the_instance_untouched(api: Api, m
     before = api.get("Deployment", NORTH)["metadata"]
     end(api, "north")
     api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="the deadline is noted"
+        "ApplicationInstance", NORTH, lambda raw: "releaseTime" in raw.get("status", {}), what="the deadline is set"
     )
     api.create(task("again", region="north"))
     api.wait_for(
-        "ApplicationInstance", NORTH, lambda raw: "releaseTime" not in raw.get("status", {}), what="the linger is over"
+        "ApplicationInstance",
+        NORTH,
+        lambda raw: "releaseTime" not in raw.get("status", {}),
+        what="the linger is cancelled",
     )
     wait_settled(api)
     after = api.get("Deployment", NORTH)["metadata"]
@@ -112,7 +115,9 @@ def test_the_last_parameter_value_is_removed_while_a_demand_without_values_remai
         "ApplicationTask", "without", lambda raw: raw.get("status", {}).get("instanceName") == name, what="both"
     )
     end(api, "with")
-    api.wait_for("ApplicationInstance", name, lambda raw: not raw["spec"].get("parameters"), what="the value is gone")
+    api.wait_for(
+        "ApplicationInstance", name, lambda raw: not raw["spec"].get("parameters"), what="the value is removed"
+    )
     wait_settled(api)
 
 
@@ -143,7 +148,7 @@ def test_two_pairs_at_one_place_share_an_instance_with_the_union_of_their_source
         "ConfigMap",
         f"{NORTH}-config",
         lambda raw: raw["data"] == {"sources": '["car1","car2"]!'},
-        what="the rest is left",
+        what="the other sources remain",
     )
     wait_settled(api)
     assert api.get("Deployment", NORTH)["metadata"]["generation"] == before["generation"]
@@ -189,7 +194,7 @@ def test_events_report_each_change_once(api: Api, manager: Process) -> None:
         ("ApplicationTask", "wrong", "Refused"),
         ("ApplicationTemplate", "app", "Accepted"),
     ]
-    wait_until(reported, lambda found: found == expected, what="the Events are there")
+    wait_until(reported, lambda found: found == expected, what="the Events are posted")
     manager.restart()
     manager.wait_for_output("watching")
     wait_settled(api)

@@ -13,7 +13,7 @@ from tests.cluster.controlplane import ControlPlane
 from tests.cluster.expected_objects import condition, deployment, start_manager, task, template, wait_settled
 from tests.cluster.processes import Processes
 
-SCHEDULER = "wayside-test"  # that of these tests only: no other pod is bound to their nodes
+SCHEDULER = "wayside-test"  # used by these tests only: no other pod is bound to their nodes
 CONFIGURATION = """
 apiVersion: kubescheduler.config.k8s.io/v1
 kind: KubeSchedulerConfiguration
@@ -25,7 +25,7 @@ profiles: [{schedulerName: %s}]
 
 @pytest.fixture
 def scheduler(control_plane: ControlPlane, processes: Processes) -> None:
-    """A real kube-scheduler, for pods that ask for it by name."""
+    """A real kube-scheduler, for pods that set its schedulerName."""
     file = processes.folder / "scheduler.yaml"
     file.write_text(CONFIGURATION % (control_plane.kubeconfig, SCHEDULER))
     program = str(ensure_binaries().kube_scheduler)
@@ -34,7 +34,7 @@ def scheduler(control_plane: ControlPlane, processes: Processes) -> None:
 
 @pytest.fixture
 def nodes(api: Api) -> Iterator[list[str]]:
-    """The nodes of two roadside units; the second takes only what tolerates it."""
+    """The nodes of two roadside units; the second has a taint."""
     names = [f"{each}-{api.namespace}"[:63] for each in ("rsu-1", "rsu-2")]
     for name, site in zip(names, ("north", "south"), strict=True):
         node(api, name, site, taints=[{"key": "edge", "effect": "NoSchedule"}] if site == "south" else [])
@@ -48,7 +48,7 @@ def node(api: Api, name: str, site: str, taints: list[Object]) -> None:
     api.create(
         {"apiVersion": "v1", "kind": "Node", "metadata": {"name": name, "labels": labels}, "spec": {"taints": taints}}
     )
-    api.patch("Node", name, {"spec": {"taints": taints}})  # without the one that each new node gets: it is not ready
+    api.patch("Node", name, {"spec": {"taints": taints}})  # without the taint not-ready, which each new node gets
     room = {"cpu": "4", "memory": "8Gi", "pods": "50"}
     api.patch("Node", name, {"status": {"capacity": room, "allocatable": room}}, subresource="status")
 
@@ -97,7 +97,7 @@ def test_a_task_places_its_application_on_the_named_node_and_a_missing_node_is_r
     api.create(task("west", node="rsu-9"))
     named = "fits no node: nodeSelector: no node has the label kubernetes.io/hostname=rsu-9"
     reported = wait_for_message(api, "west", named, "no node fits the pod")
-    assert nodes[0] in reported["status"]["message"]  # what there is instead
+    assert nodes[0] in reported["status"]["message"]  # the existing value
     api.wait_for(
         "ApplicationInstance",
         instance_name("app", "west"),
@@ -119,7 +119,7 @@ def test_affinity_and_tolerations_come_from_parameters_too(
     affinity = {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": required}}
     api.create(placed(affinity=affinity, tolerations=[{"key": "${parameters.tolerate}", "operator": "Exists"}]))
     api.create(task("south"))
-    wait_for_message(api, "south", "no node fits the pod", "untolerated taint")  # of what fits, the scheduler speaks
+    wait_for_message(api, "south", "no node fits the pod", "untolerated taint")  # by the scheduler
     api.create(task("more", region="south", tolerate="edge"))
     wait_bound(api, "south", nodes[1])
     api.create(task("west"))

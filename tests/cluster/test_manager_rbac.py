@@ -66,7 +66,7 @@ def account(api: Api, namespace: str, control_plane: ControlPlane) -> Path:
 
 
 def without(manifests: list[Object], group: str, resource: str, verb: str) -> list[Object]:
-    """The same roles, with one verb on one resource fewer, in all of them."""
+    """The same roles, all without one verb on one resource."""
     found = copy.deepcopy(manifests)
     for role in found:
         split = []
@@ -89,7 +89,7 @@ def put(api: Api, manifests: list[Object]) -> None:
 
 
 def wait_in_force(account: Path, namespace: str, manifests: list[Object]) -> None:
-    """Wait until the account has all that the roles give: the API server learns of them by watches, a moment later."""
+    """Wait until the account has all rights of the roles: the API server's watches report the roles a moment later."""
     client = Api(account, namespace)
 
     def lacks() -> list[Verb]:
@@ -112,12 +112,12 @@ def may(account: Api, namespace: str, group: str, resource: str, verb: str, name
 
 
 def each_verb_is_missed(api: Api, whole: list[Object], lacks: Callable[[], list[Verb]]) -> None:
-    """Take away one verb of every resource at a time, until each was away; `lacks` must find these, and no other."""
+    """Remove each verb in turn, from every resource at once; `lacks` must find the removed verbs and no others."""
     by_resource = [sorted(each) for _, each in itertools.groupby(sorted(granted(whole)), key=lambda verb: verb[:2])]
     for removed in itertools.zip_longest(*by_resource):
         expected = sorted(filter(None, removed))
         put(api, functools.reduce(lambda manifests, verb: without(manifests, *verb), expected, whole))
-        wait_until(lacks, expected.__eq__, what=f"{expected} lack, and nothing else")
+        wait_until(lacks, expected.__eq__, what=f"exactly {expected} are missing")
 
 
 def used(seen: list[ProxiedRequest], namespace: str) -> Iterator[Verb]:
@@ -176,7 +176,7 @@ def test_a_life_cycle_needs_exactly_the_printed_rights(
         api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 0, what="it is suspended")
         end(api, "stop")
         api.wait_for("Deployment", NORTH, lambda raw: raw["spec"]["replicas"] == 1, what="it is resumed")
-        for value, status in (("anna", "True"), (None, "False"), ("anna", "True")):  # what is repeated is a series
+        for value, status in (("anna", "True"), (None, "False"), ("anna", "True")):  # repeated Events become a series
             api.patch("ApplicationInstance", NORTH, {"metadata": {"annotations": {"wayside.dev/pause": value}}})
             api.wait_for(
                 "ApplicationInstance",
@@ -216,7 +216,7 @@ def test_a_life_cycle_needs_exactly_the_printed_rights(
     requested = set(used(proxy.seen, namespace))
     for group, resource, verb in [*requested]:
         if verb == "patch" and resource in ("applicationinstances", "deployments", "configmaps"):
-            requested.add((group, resource, "create"))  # an apply of what is not there yet needs both
+            requested.add((group, resource, "create"))  # an apply that creates an object needs both
     never = {("coordination.k8s.io", "leases", "get")} if "/leases/wayside-" not in str(proxy.seen) else set()
     instance_after_a_failure = {("wayside.dev", "applicationinstances", "get")}
     assert granted(manifests) - requested - never <= instance_after_a_failure
@@ -245,7 +245,7 @@ def test_a_manager_of_all_namespaces_writes_only_in_granted_ones(
             api.wait_for("Deployment", name, lambda _: True, what="the detector has its rights and its pod")
             wait_settled(api)
             manager.wait_for_output(f"ignoring namespace {other.namespace}, which is not granted to this manager")
-            assert not list(used(proxy.seen, other.namespace)), "it neither reads nor writes there, whatever there is"
+            assert not list(used(proxy.seen, other.namespace)), "it neither reads nor writes there"
             assert other.find("ApplicationInstance", NORTH) is None
 
             what_it_cannot_do(Api(account, namespace), Api(account, other.namespace), api.get("Role", name))
@@ -262,7 +262,7 @@ def test_a_manager_of_all_namespaces_writes_only_in_granted_ones(
 
 
 def what_it_cannot_do(here: Api, elsewhere: Api, role: Object) -> None:
-    """The manager's account cannot do these.
+    """Check that the manager's account cannot do these actions.
 
     Args:
         here: with the account, for a namespace that is granted.
@@ -290,7 +290,7 @@ def what_it_cannot_do(here: Api, elsewhere: Api, role: Object) -> None:
             here.create(binding)
         with pytest.raises(ApiError, match='cannot create resource "clusterrolebindings"'):
             here.create(binding | {"kind": "ClusterRoleBinding"})
-    here.create(more | {"rules": role["rules"]})  # a detector's rights it can grant where it may write, and only there
+    here.create(more | {"rules": role["rules"]})  # it can grant a detector's rights only where it may write
     with pytest.raises(ApiError, match='cannot create resource "roles"'):
         elsewhere.create(more | {"rules": role["rules"]})
     lease = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease", "metadata": {"name": "any"}, "spec": {}}
@@ -360,7 +360,9 @@ def test_a_missing_optional_right_is_reported_at_the_start_and_where_it_is_neede
     assert "apply the output of `application-manager rbac`" in message
     api.wait_for("Deployment", instance_name("other", "south"), lambda _: True, what="others are served")
     put(api, whole)
-    api.wait_for("ConfigMap", f"{NORTH}-config", lambda _: True, what="with the right it is made")
+    api.wait_for(
+        "ConfigMap", f"{NORTH}-config", lambda _: True, what="the ConfigMap is created once the right is granted"
+    )
     wait_settled(api)
 
 

@@ -1,6 +1,6 @@
 """Ready means that the workload serves; the task reports why its pods do not run.
 
-There is no kubelet here: the test writes what one writes into the status of a pod.
+There is no kubelet here: the test writes the statuses of pods as a kubelet would.
 """
 
 from __future__ import annotations

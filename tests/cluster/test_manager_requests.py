@@ -12,16 +12,16 @@ from tests.cluster.waiting import wait_until
 
 MANY = 5
 QUICK = 1.5
-"""Seconds from a Deployment to the first status, below the time that this waits for the controllers: later there are
-two statuses."""
+"""The maximum number of seconds from a Deployment to the first status, below the manager's wait for the controllers:
+after it, there are two statuses."""
 BESIDE = 4
-"""Requests for a task with an instance of its own, beside the two applies: look, two statuses, an Event."""
+"""Requests for a task with its own instance, in addition to the two applies: a read, two statuses, an Event."""
 
 LISTS_AND_LEASES = ("watch=true", "limit=", "/leases", "/selfsubjectaccessreviews")
 
 
 def about_tasks(proxy: Proxy, since: int) -> list[ProxiedRequest]:
-    """The requests that are neither lists, which come with time and not with tasks, nor about Leases."""
+    """The requests without lists, whose number depends on time and not on tasks, and without those about Leases."""
     return [each for each in proxy.seen[since:] if not any(part in each.path for part in LISTS_AND_LEASES)]
 
 
@@ -52,8 +52,8 @@ def test_a_task_with_an_instance_of_its_own_takes_two_applies_and_four_other_req
             since = len(proxy.seen)
             api.create(task(f"t{number}"))
             name = instance_name("app", f"t{number}")
-            api.wait_for("ApplicationInstance", name, has_status, what="the instance has it")
-            api.wait_for("ApplicationTask", f"t{number}", has_status, what="so does the task")
+            api.wait_for("ApplicationInstance", name, has_status, what="the instance has the condition")
+            api.wait_for("ApplicationTask", f"t{number}", has_status, what="the task has it too")
             wait_settled(api)
             seen = [each for each in about_tasks(proxy, since) if "/applicationtemplates/" not in each.path]
             if is_quick(seen):

@@ -37,7 +37,7 @@ def test_a_rules_status_follows_its_detectors_and_reports_errors(
         "EventRule",
         name,
         lambda raw: "recorder" not in condition(raw, "Accepted")["message"],
-        what="its template is there",
+        what="its template exists",
     )
     api.wait_for(
         "Detector",
@@ -53,5 +53,8 @@ def test_a_rules_status_follows_its_detectors_and_reports_errors(
         assert part in reported["message"]
     api.delete("EventRule", name)
     api.wait_for(
-        "Detector", "intersection-a", lambda raw: raw.get("status", {}).get("rules") == 0, what="it is counted no more"
+        "Detector",
+        "intersection-a",
+        lambda raw: raw.get("status", {}).get("rules") == 0,
+        what="it is no longer counted",
     )

@@ -1,7 +1,7 @@
 """Namespaces take turns: a backlog in one does not delay the tasks and statuses of others.
 
-Versions give the order of writes: they grow over all objects of the cluster. Everything is there before the manager
-starts, so it is all enqueued at once, that of the small namespace last.
+Resource versions give the order of writes: they increase over all objects of the cluster. All objects exist before the
+manager starts, so they are all enqueued at once, those of the small namespace last.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from tests.cluster.processes import Processes
 MANY = 150
 LIMITED = "*/det:max-tasks=1,max-priority=10,operations=Deploy+Reconfigure"
 AHEAD = MANY // 2
-"""Maximum number of the many that may be written before the last one; without turns it would be all."""
+"""The maximum number of the flood's objects written before the last one; without fair turns, all of them would be."""
 
 
 def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_statuses(
     api: Api, namespace: str, control_plane: ControlPlane, processes: Processes
 ) -> None:
-    small = control_plane.api(new_namespace(control_plane.api(), "zz-small"))  # listed after the other
+    small = control_plane.api(new_namespace(control_plane.api(), "zz-small"))  # listed after the other namespace
     refused = {"of": "missing"}
     made = template(manifests=[config({"region": "${parameters.region}"})])
     for each, count in ((api, MANY), (small, 1)):
@@ -46,7 +46,7 @@ def test_a_flood_in_one_namespace_delays_neither_what_another_applies_nor_its_st
     others = api.wait_list(
         "ApplicationTask",
         lambda found: all(condition(each, "Accepted") for each in found if _is_refused(each)),
-        what="all tasks that are refused have a status",
+        what="all rejected tasks have a status",
     )
     ahead = [each for each in others if _is_refused(each) and _version(each) < _version(reported)]
     assert len(ahead) < AHEAD
@@ -65,7 +65,7 @@ def test_tasks_beyond_the_budget_of_their_namespace_wait_until_older_ones_end(
     assert "the limit of 2 unfinished tasks" in waiting["message"]
     assert api.find("Deployment", instance_name("app", "c")) is None
     end(api, "a")
-    api.wait_for("Deployment", instance_name("app", "c"), lambda _: True, what="the next one is served")
+    api.wait_for("Deployment", instance_name("app", "c"), lambda _: True, what="the next task is served")
     _wait_accepted(api, "c", "Accepted")
 
 
@@ -78,7 +78,7 @@ def test_a_holder_is_limited_to_its_budget_and_people_are_not(api: Api, namespac
     for name, reported in (("urgent", "spec.priority: 11 is above 10"), ("stopping", "spec.operation: Suspend")):
         _wait_accepted(api, name, "NotAllowed")
         assert reported in api.get("ApplicationTask", name)["status"]["message"]
-    api.create(task("first", holder="det"))  # what is refused takes nothing of the budget
+    api.create(task("first", holder="det"))  # rejected tasks do not count towards the budget
     _wait_accepted(api, "first", "Accepted")
     api.create(task("second", holder="det"))
     _wait_accepted(api, "second", "LimitReached")
@@ -87,7 +87,7 @@ def test_a_holder_is_limited_to_its_budget_and_people_are_not(api: Api, namespac
     person = task("person", region="first")
     api.create({**person, "spec": {**person["spec"], "operation": "Suspend", "priority": 1000}})
     deployment = instance_name("app", "first")
-    api.wait_for("Deployment", deployment, lambda raw: raw["spec"]["replicas"] == 0, what="a person suspends it")
+    api.wait_for("Deployment", deployment, lambda raw: raw["spec"]["replicas"] == 0, what="a user suspends it")
     api.delete("ApplicationTask", "first")
     _wait_accepted(api, "second", "Accepted")
 

@@ -33,7 +33,7 @@ WAITING = {"232", "281", "22"}
 
 @dataclass
 class Pair:
-    """An active manager and its standby, each with a network of its own and a port for its pages."""
+    """An active manager and its standby, each with its own proxy and a port for its pages."""
 
     active: Process
     standby: Process
@@ -42,11 +42,11 @@ class Pair:
     ports: list[int]
 
     def taken_over(self) -> None:
-        """Wait until the standby acts."""
+        """Wait until the standby is active."""
         self.standby.wait_for_output(ACTIVE)
 
     def never_both(self) -> None:
-        """The new one began to write only after the last write of the old one was sent."""
+        """Check that the new manager first wrote only after the old one had sent its last write."""
         began = min(each.at for each in self.new.writes())
         assert [each for each in self.old.writes() if each.at >= began] == []
 
@@ -65,15 +65,15 @@ def pair(processes: Processes, namespace: str, control_plane: ControlPlane) -> I
 
 
 def demanded(api: Api) -> None:
-    """Give the active manager work, and return while it is at it."""
+    """Give the active manager work; return while it is working."""
     api.create(template())
     for region in REGIONS:
         api.create(task(region))
-    api.wait_list("Deployment", lambda found: len(found) >= 5, what="the manager is in the middle of it")
+    api.wait_list("Deployment", lambda found: len(found) >= 5, what="the manager has done a part of the work")
 
 
 def interrupted(api: Api, pair: Pair, how: Callable[[Pair], None]) -> None:
-    """Interrupt the active manager amid its work; the standby finishes it and makes nothing twice."""
+    """Interrupt the active manager during its work; the standby finishes it and creates no object twice."""
     demanded(api)
     how(pair)
     before = uids(api)
@@ -81,9 +81,11 @@ def interrupted(api: Api, pair: Pair, how: Callable[[Pair], None]) -> None:
     end(api, REGIONS[0])
     pair.taken_over()
     wait_settled(api)
-    api.wait_list("Deployment", lambda found: len(found) == len(REGIONS), what="what is demanded runs, and no more")
+    api.wait_list("Deployment", lambda found: len(found) == len(REGIONS), what="exactly the demanded instances run")
     after = uids(api)
-    assert {name: uid for name, uid in before.items() if after.get(name, uid) != uid} == {}, "nothing was made twice"
+    assert {name: uid for name, uid in before.items() if after.get(name, uid) != uid} == {}, (
+        "no object was created twice"
+    )
     pair.never_both()
     assert api.get("Lease", LEASE)["spec"]["leaseTransitions"] == 1
 
@@ -93,16 +95,16 @@ def uids(api: Api) -> dict[str, str]:
 
 
 def stopped(pair: Pair) -> None:
-    """Stop the active one while its requests are under way and it waits for answers.
+    """Stop the active manager while its requests are in progress and it waits for answers.
 
-    Between its last look at whether it may still write and the system call that writes, nothing can hold it back (it is
-    described in wayside/kubernetes/fence.py): a stop within these microseconds would show nothing but that.
+    Between its last check whether it may still write and the system call of the write, nothing can prevent the write
+    (see wayside/kubernetes/fence.py): a stop within these microseconds would only show this known limit.
     """
     wait_until(lambda: stopped_in(pair.active.pid), lambda call: call in WAITING, what="it is stopped while it waits")
 
 
 def stopped_in(pid: int) -> str:
-    """Stop the process: the number of the system call that it is in, or -1. If it is not waiting, it continues for
+    """Stop the process; return the number of its current system call, or -1. If it is not waiting, it continues for
     now."""
     os.kill(pid, signal.SIGSTOP)
     status = Path(f"/proc/{pid}/status")
@@ -127,15 +129,15 @@ def test_a_suspended_manager_writes_nothing_when_it_continues(api: Api, pair: Pa
         end(api, name)
     os.kill(pair.active.pid, signal.SIGCONT)
     pair.active.wait_for_output("no longer active|standby: manager_")
-    api.wait_list("Deployment", lambda found: not found, what="nothing runs that nobody demands")
+    api.wait_list("Deployment", lambda found: not found, what="only demanded instances run")
     wait_settled(api)
     wait_until(
         lambda: get(pair.ports[0], "/readyz")[1], lambda logged: logged.startswith("ok, standby: "), what="a standby"
     )
     pair.never_both()
-    # And it can take over in turn, with what it has seen meanwhile.
+    # It can take over again, with the changes it has watched meanwhile.
     api.create(task("next"))
-    api.wait_list("Deployment", lambda found: len(found) == 1, what="the other serves it")
+    api.wait_list("Deployment", lambda found: len(found) == 1, what="the other manager serves it")
     pair.standby.kill9()
     end(api, "next")
     api.create(task("last"))
@@ -169,11 +171,11 @@ def test_metrics_and_readiness_show_the_active_manager(api: Api, pair: Pair) -> 
     wait_until(
         lambda: [scraped(port)["active",] for port in pair.ports],
         lambda found: found == [1, 0],
-        what="the metrics show it",
+        what="the metrics show the active manager",
     )
     wait_until(lambda: get(pair.ports[0], "/readyz"), lambda found: found == (200, "ok\n"), what="one is active")
     logged = (200, f"ok, standby: {holder} is active\n")
-    wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == logged, what="the other stands by")
+    wait_until(lambda: get(pair.ports[1], "/readyz"), lambda found: found == logged, what="the other is the standby")
 
 
 def test_a_manager_that_ends_releases_the_lease(api: Api, processes: Processes, namespace: str) -> None:
@@ -194,7 +196,7 @@ def test_a_manually_deleted_manager_lease_is_recreated(api: Api, processes: Proc
     manager.wait_for_output(ACTIVE)
     uid = api.get("Lease", LEASE)["metadata"]["uid"]
     api.delete("Lease", LEASE)
-    api.wait_for("Lease", LEASE, lambda raw: raw["metadata"]["uid"] != uid, what="it is there again")
+    api.wait_for("Lease", LEASE, lambda raw: raw["metadata"]["uid"] != uid, what="the Lease exists again")
     api.create(template())
     api.create(task("north"))
     wait_settled(api)

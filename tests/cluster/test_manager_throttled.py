@@ -14,10 +14,10 @@ from tests.cluster.processes import Processes
 from tests.cluster.waiting import wait_until
 from wayside.kubernetes.pacing import AT_ONCE, MOST_WRITES
 
-WATCHERS = 8  # requests of watches that (re)list, and those about the Lease: apart from the bound
-BURST = 100  # tasks: many times what may run at once
-HOLD = 9  # s for which the API server wants to be left alone
-LATE = 3.0  # s by which the proxy may see a request late, on a machine that is busy otherwise
+WATCHERS = 8  # requests of watches that (re)list, and those about the Lease, are not limited
+BURST = 100  # tasks: many times the maximum of concurrent requests
+HOLD = 9  # s of the API server's Retry-After
+LATE = 3.0  # s that the proxy may see a request late on a busy machine
 
 
 def test_a_burst_of_tasks_is_served_with_few_concurrent_requests(
@@ -26,14 +26,14 @@ def test_a_burst_of_tasks_is_served_with_few_concurrent_requests(
     with faulty_proxy(control_plane.kubeconfig) as (proxy, kubeconfig):
         start_manager(processes, namespace, kubeconfig=kubeconfig).wait_for_output("active: holds the Lease")
         api.create(template())
-        # So slow that all that may run at once does, and that it is no matter how long the machine itself takes.
+        # So slow that the maximum of concurrent requests is reached, independent of the machine's speed.
         proxy.most, proxy.slow = 0, max(0.2, 5 * longest(api))
         with ThreadPoolExecutor(8) as pool:
             list(pool.map(api.create, (task(f"t{index}", region=f"r{index % 20}") for index in range(BURST))))
         wait_until(
             lambda: [each.get("status", {}).get("phase") for each in api.list("ApplicationTask")].count("Active"),
             BURST.__eq__,
-            what="all tasks are answered, and served",
+            what="all tasks have a status and are served",
         )
         assert MOST_WRITES // 2 < proxy.most <= AT_ONCE + WATCHERS
         proxy.slow = 0
@@ -55,13 +55,13 @@ def test_no_request_is_sent_before_the_servers_retry_after_has_passed(
         proxy.refuse = refuse
         for index in range(10):
             api.create(task(f"t{index}"))
-        api.wait_list("Deployment", lambda found: len(found) == 10, what="all is served in the end")
+        api.wait_list("Deployment", lambda found: len(found) == 10, what="all tasks are served in the end")
         wait_settled(api)
         (refused,) = (each for each in proxy.seen if each.refused)
         own = [each for each in proxy.seen if "/leases" not in each.path and not watches(each)]
         served = max(each.at for each in own if each.method == "PATCH" and "/deployments/" in each.path)
         assert served >= refused.at + HOLD
-        # What was sent before the answer had arrived comes first, however long that took.
+        # Requests that were sent before the answer arrived come first.
         times = sorted(each.at for each in own if refused.at <= each.at <= served)
         assert max(after - before for before, after in itertools.pairwise(times)) >= HOLD - LATE
         assert "Traceback" not in manager.output()
@@ -84,13 +84,13 @@ def test_an_api_server_that_rejects_everything_for_a_while_is_waited_for(
         requested = [each for each in proxy.seen if each.at > began and each.refused]
         proxy.refuse = lambda method, path: None
         assert len(requested) < 200, "it does not storm"
-        api.wait_list("Deployment", lambda found: len(found) == 21, what="all is served in the end")
+        api.wait_list("Deployment", lambda found: len(found) == 21, what="all tasks are served in the end")
         wait_settled(api)
         assert manager.alive
 
 
 def longest(api: Api) -> float:
-    """The longest of some requests, in seconds."""
+    """The duration of the longest of some requests, in seconds."""
     took = []
     for _ in range(10):
         began = time.monotonic()

@@ -1,4 +1,4 @@
-"""The account's token is renewed on a real API server, which no longer takes the old one."""
+"""The account's token is renewed on a real API server, which no longer accepts the old one."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_rejected_token_is_replaced_by_the_new_one_of_the_file(
                     except ApiError as error:
                         if error.code not in (401, 403):
                             raise
-                        found = error.code == 403  # the token is taken, and the role is not known yet
+                        found = error.code == 403  # the token is accepted; the role is not in force yet
                     if found is taken:
                         return
                     await asyncio.sleep(0.1)

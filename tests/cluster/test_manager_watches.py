@@ -19,7 +19,7 @@ from tests.cluster.test_manager_metrics import scraped
 from tests.ports import free_port
 
 SOUTH = instance_name("app", "south")
-SELDOM = ("--resync", "300s", "--watch-timeout", "3s")  # what comes in time comes by a watch
+SELDOM = ("--resync", "300s", "--watch-timeout", "3s")  # only a watch delivers changes in time
 
 CANCELLING = """
 import asyncio, signal
@@ -31,7 +31,7 @@ def cancel(*_):
 
 signal.signal(signal.SIGUSR1, cancel)
 """
-"""What a stall does to a watch of kopf, see docs/decisions/0026: the task that reads it is cancelled."""
+"""A stall cancels the task that reads a watch of kopf, see docs/decisions/0026."""
 
 
 def test_a_watch_on_a_silent_connection_is_restarted(
@@ -50,7 +50,7 @@ def test_a_watch_on_a_silent_connection_is_restarted(
             if "watch=true" in each.path and "/applicationtasks?" in each.path
         )
         api.create(task("south"))
-        api.wait_for("Deployment", SOUTH, lambda _: True, what="the task is heard of by a new watch")
+        api.wait_for("Deployment", SOUTH, lambda _: True, what="a new watch reports the task")
         manager.wait_for_output("the watch of applicationtasks in .* had no event or bookmark")
         wait_settled(api)
         assert manager.alive

@@ -29,14 +29,14 @@ child.wait()
 
 @pytest.fixture
 def processes(tmp_path: Path) -> Iterator[Processes]:
-    """Not that of the control plane, which these tests do not need."""
+    """Replaces the control plane's fixture, which these tests do not need."""
     started = Processes(tmp_path, {})
     yield started
     started.kill_all()
 
 
 def exists(pid: int) -> bool:
-    """Whether a process lives; a zombie that nobody waited for does not."""
+    """Whether a process is alive; a zombie is not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except FileNotFoundError:

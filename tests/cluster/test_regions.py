@@ -30,7 +30,7 @@ REGIONS = ("north", "center", "south")
 
 
 class Road:
-    """Publishes a vehicle that requests assistance and one that does not, from where the test has put them."""
+    """Publishes a vehicle that requests assistance and one that does not, at the positions that the test sets."""
 
     def __init__(self, endpoint: str) -> None:
         self.x = 500.0
@@ -57,7 +57,7 @@ def documents(file: str, endpoint: str) -> list[Object]:
 
 
 def wait_demands(api: Api, *regions: str) -> list[Object]:
-    """Wait until the live tasks are those of these regions; they are of one instance."""
+    """Wait until the live tasks are those of these regions; all are of one instance."""
 
     def live(tasks: list[Object]) -> list[Object]:
         return [each for each in tasks if "endTime" not in each["spec"]]
@@ -75,7 +75,7 @@ def wait_demands(api: Api, *regions: str) -> list[Object]:
 
 
 def wait_application(api: Api, where: str) -> tuple[Object, Object, list[Object]]:
-    """Wait until the application's configuration names this area alone; its instance, Deployment and pods."""
+    """Wait until the application's configuration has only this area; return its instance, Deployment and pods."""
     (instance,) = api.wait_list(
         "ApplicationInstance",
         lambda found: [each["spec"]["parameters"].get("areas") for each in found] == [[where]],
@@ -87,8 +87,8 @@ def wait_application(api: Api, where: str) -> tuple[Object, Object, list[Object]
         labels="app.kubernetes.io/managed-by=wayside",
         what=f"the application's configuration names {where}",
     )
-    (deployment,) = api.wait_list("Deployment", lambda found: len(found) == 1, what="there is one Deployment")
-    pods = api.wait_list("Pod", lambda found: len(found) == 1, what="there is one pod")
+    (deployment,) = api.wait_list("Deployment", lambda found: len(found) == 1, what="exactly one Deployment exists")
+    pods = api.wait_list("Pod", lambda found: len(found) == 1, what="exactly one pod exists")
     return instance, deployment, pods
 
 

@@ -34,9 +34,9 @@ from cooperative_recording.vehicles import simulate  # noqa: E402
 
 SEED, DURATION = 3528, 25.0
 EVALUATION = 0.5  # s, of the example's rule
-REACTION = 2.0  # s from the evaluation to a Deployment that is there, or gone
+REACTION = 2.0  # s from the evaluation until the Deployment is created or deleted
 REQUESTS = 10  # the period of queries to the API server
-LOOKING = 0.1  # s between two looks of the observer
+LOOKING = 0.1  # s between two lists of the observer
 SAMPLING = 0.2  # s: a pose is up to 0.1 s old, and so is what the observer saw
 
 
@@ -52,7 +52,7 @@ class Snapshot:
 
 @dataclass
 class Observer:
-    """Looks at the Deployments and ConfigMaps of a namespace ten times a second."""
+    """Lists the Deployments and ConfigMaps of a namespace ten times a second."""
 
     api: Api
     seen: list[Snapshot] = field(default_factory=list)
@@ -81,7 +81,7 @@ def _vehicles(deployment: dict[str, Any]) -> tuple[str, ...]:
 
 
 def apply_example(api: Api, namespace: str, endpoint: str) -> None:
-    """The example's own files, but for the endpoint."""
+    """The example's own files with another endpoint."""
     for file in ("templates.yaml", "rules.yaml", "detector.yaml"):
         for document in yaml.safe_load_all((EXAMPLE / file).read_text(encoding="utf-8")):
             document["metadata"]["namespace"] = namespace
@@ -115,7 +115,7 @@ def test_the_deployments_over_time_match_the_vehicles_positions(
     with observer.watching():
         logged = re.search(r"stamps from (\d+) ns, at most (\d+) ms late$", drive(endpoint).strip())
         assert logged is not None
-        api.wait_list("Deployment", lambda found: not found, what="all applications are gone")
+        api.wait_list("Deployment", lambda found: not found, what="all applications are deleted")
     assert detector.terminate() == 0
 
     judge = episodes(simulate(SEED, DURATION), DURATION)
@@ -144,9 +144,8 @@ def test_the_deployments_over_time_match_the_vehicles_positions(
 class Timeline:
     """The snapshots by seconds into the drive, and their maximum delay.
 
-    A machine that is slow is so for vehicles and observer too: by how much poses were sent late, by how much longer
-    the API server takes, and for how long the observer itself was kept from looking, what comes of them may be late
-    as well.
+    A slow machine also slows the vehicles and the observer. The results may be late by the sum of three delays: of the
+    poses, of the API server, and of the observer's own lists.
     """
 
     seen: list[Snapshot]
@@ -160,7 +159,7 @@ class Timeline:
 
     @property
     def _kept_s(self) -> float:
-        """For how long the observer wanted to look and was not let."""
+        """The delay of the observer's lists."""
         pauses = ((after.since_ns - each.since_ns) / 1e9 - each.took_s for each, after in pairwise(self.seen))
         return max(0.0, max(pauses) - LOOKING)
 
@@ -170,11 +169,11 @@ class Timeline:
 
 def assert_recorders(seen: Timeline, spans: dict[tuple[str, str], list[Any]]) -> None:
     """A recorder exists during its pair's span, within the tolerance, and at no other time."""
-    assert len(seen.seen) > DURATION, "the observer must have looked often enough to prove anything"
+    assert len(seen.seen) > DURATION, "the observer must have listed often enough for a meaningful result"
     assert {pair for _, moment in seen for pair in moment.pairs} == spans.keys()
     allowed = seen.allowed
     for at, moment in seen:
-        until = at + moment.took_s  # a look does not show when within this time it was so
+        until = at + moment.took_s  # a list does not show when within this time the state held
         for pair, its in spans.items():
             exists = pair in moment.pairs
             must = any(span.start_s + allowed <= at and until <= (span.end_s or DURATION) - SAMPLING for span in its)
@@ -184,7 +183,7 @@ def assert_recorders(seen: Timeline, spans: dict[tuple[str, str], list[Any]]) ->
 
 
 def assert_fusions(seen: Timeline, expected: dict[str, list[Any]]) -> None:
-    """The sources at a place are at each moment those of some state that is due about then."""
+    """The sources at a place are at each moment those of an expected state at about that time."""
     met = dict.fromkeys(expected, 0)
     allowed = seen.allowed
     for at, moment in seen:
@@ -202,9 +201,9 @@ def assert_fusions(seen: Timeline, expected: dict[str, list[Any]]) -> None:
             if sources is None:
                 assert not settled, f"at {at:.2f} s there is no fusion at {place}: {states}"
             else:
-                assert sources in due, f"at {at:.2f} s the fusion at {place} has {sources}, due is {due}"
+                assert sources in due, f"at {at:.2f} s the fusion at {place} has {sources}, not {due}"
                 met[place] += 1
-    assert all(met.values()), f"each place must have been seen fused: {met}"
+    assert all(met.values()), f"each place must have had a fusion: {met}"
 
 
 def events_of(folder: Path) -> list[str]:
@@ -229,7 +228,7 @@ def test_with_clock_data_a_recording_gives_the_same_events_played_live_and_repla
     detector.wait_for_output("Detector town runs with 1 rules")
     drive(endpoint, "--start", str(start_ns))
     expected = 2 * len(episodes(simulate(SEED, DURATION), DURATION))
-    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, what="all events are there")
+    wait_until(lambda: len(events_of(live)), lambda count: count >= expected, what="all events are written")
     assert detector.terminate() == 0
     subprocess.run(
         [sys.executable, "-m", "detector.commands.cli", "replay", str(recording), *files, "--output", str(replayed)],

@@ -66,10 +66,10 @@ def test_role_bindings_follow_the_accounts_of_the_detector(
         "Detector",
         HOLDER,
         lambda raw: condition(raw, "Running").get("reason") == "NoAccounts",
-        what="its reason is written",
+        what="its status has the reason",
     )
     assert "spec.serviceAccountNames: is empty" in condition(written, "Running")["message"]
-    # Who is named no more has no rights any more, be the rest of the Detector right or wrong.
+    # An account that is no longer listed has no rights, whether the rest of the Detector is valid or not.
     api.patch("Detector", HOLDER, {"spec": {"serviceAccountNames": ["vehicle"]}})
     settles(vehicle)
     wrong = detector()["spec"]["streams"][0] | {"stamp": "msg.t +"}
@@ -79,14 +79,14 @@ def test_role_bindings_follow_the_accounts_of_the_detector(
         "Detector",
         HOLDER,
         lambda raw: condition(raw, "Running").get("reason") == "NotAccepted",
-        what="its reason is written",
+        what="its status has the reason",
     )
 
 
 def test_changing_the_mode_removes_the_objects_of_the_old_mode(api: Api, processes: Processes, namespace: str) -> None:
     start_manager(processes, namespace, *RUNS)
     api.create(detector(mode="Standalone"))
-    api.wait_for("Deployment", NAME, bool, what="it runs by itself")
+    api.wait_for("Deployment", NAME, bool, what="it runs standalone")
     api.patch("Detector", HOLDER, {"spec": {"mode": "Sidecar", "serviceAccountNames": ["vehicle"]}})
     for kind in ("Deployment", "ServiceAccount"):
         api.wait_gone(kind, NAME)
@@ -94,7 +94,7 @@ def test_changing_the_mode_removes_the_objects_of_the_old_mode(api: Api, process
         "RoleBinding", NAME, lambda raw: raw["subjects"][0]["name"] == "vehicle", what="its accounts are bound"
     )
     api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone", "serviceAccountNames": None}})
-    api.wait_for("Deployment", NAME, bool, what="it runs by itself again")
+    api.wait_for("Deployment", NAME, bool, what="it runs standalone again")
     api.wait_for("RoleBinding", NAME, lambda raw: raw["subjects"][0]["name"] == NAME, what="its own account is bound")
     api.delete("Detector", HOLDER)
     for kind in ("Deployment", "ServiceAccount", "Role", "RoleBinding"):
@@ -145,7 +145,7 @@ def test_a_sidecar_acts_for_its_own_pod_only_and_needs_exactly_its_rights(
         running.wait_for_output(f"Detector {HOLDER} runs with 1 rules")
         with Vehicles(endpoint) as vehicles:
             vehicles.place(CARS, NEAR)
-            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="there is a task")
+            (task,) = api.wait_list("ApplicationTask", lambda found: len(live(found)) == 1, what="a task exists")
             vehicles.place(CARS, FAR)
             api.wait_list("ApplicationTask", lambda found: bool(found) and not live(found), what="the task has ended")
         assert status_of(tmp_path, endpoint) == [holder]

@@ -105,7 +105,7 @@ def test_a_pod_that_requests_a_detector_gets_it_once_and_as_the_command_prints_i
 
 
 def without_token(items: list[Object]) -> list[Object]:
-    """Without what Kubernetes itself adds under a name that it makes up."""
+    """The pod without the parts that Kubernetes adds under generated names."""
     return [each for each in items if not each["name"].startswith("kube-api-access-")]
 
 
@@ -130,7 +130,11 @@ def test_a_second_webhook_call_for_the_same_pod_adds_nothing(
                 assert (len(set(names)), len(sidecars(made))) == (len(names), min(len(sidecars(made)), 1))
                 return reviews_of_pods(metrics) - before if sidecars(made) else 0
 
-            wait_until(number_of_reviews, lambda found: found == 2, what="it is called twice, and the pod has it once")
+            wait_until(
+                number_of_reviews,
+                lambda found: found == 2,
+                what="the webhook is called twice, and the pod has one sidecar",
+            )
         finally:
             api.delete("MutatingWebhookConfiguration", other["metadata"]["name"])
 
@@ -157,7 +161,9 @@ def test_pods_of_a_deployment_get_the_detector(api: Api, requested: Webhook) -> 
             },
         }
     )
-    api.wait_list("Pod", lambda found: sum(len(sidecars(each)) for each in found) == 2, what="both pods have it")
+    api.wait_list(
+        "Pod", lambda found: sum(len(sidecars(each)) for each in found) == 2, what="both pods have the sidecar"
+    )
     assert not api.get("Deployment", "cars")["spec"]["template"]["spec"].get("initContainers")
 
 
@@ -172,11 +178,11 @@ def test_a_pod_that_cannot_get_a_detector_is_created_with_an_event_that_gives_th
     event_of(api, "foreign", f"serviceAccountNames of Detector {HOLDER} has only vehicle, not other: add it")
 
     api.patch("Detector", HOLDER, {"spec": {"mode": "Standalone", "serviceAccountNames": None}})
-    # The manager learns of a change by its watch, a moment later.
+    # The manager's watch reports the change a moment later.
     wait_until(
         lambda: sidecars(api.apply(pod("probe"), dry_run=True)),
         lambda injected: not injected,
-        what="the manager knows that the Detector is Standalone",
+        what="the manager has seen that the Detector is Standalone",
     )
     assert not sidecars(api.create(pod("late")))
     event_of(api, "late", "has mode Standalone: give it mode Sidecar")

@@ -33,11 +33,11 @@ def receiver(processes: Processes) -> Iterator[Receiver]:
 
 
 def wait_spans(receiver: Receiver, *names: str) -> dict[str, Received]:
-    """Wait until just one span of each of these names is there, and return them."""
+    """Wait until exactly one span of each of these names has arrived; return them."""
     found = wait_until(
         lambda: [each for each in receiver.spans() if each.name in names],
         lambda spans: sorted(each.name for each in spans) == sorted(names),
-        what=f"the spans {names} have come",
+        what=f"the spans {names} have arrived",
     )
     return {each.name: each for each in found}
 
@@ -107,7 +107,7 @@ def test_an_episode_that_is_restored_ends_the_same_span(chain: Chain, receiver: 
         episode = wait_spans(receiver, "episode close")["episode close"]
     assert (episode.trace, episode.id) == (created.trace, created.parent)
     assert {each["traceparent"] for each in chain.events(*CARS)} == {episode.traceparent}
-    wait_spans(receiver, "episode close", "create task record", "ready")  # nothing is exported twice
+    wait_spans(receiver, "episode close", "create task record", "ready")  # no span is exported twice
 
 
 @pytest.mark.usefixtures("kubelet")
@@ -127,11 +127,11 @@ def test_a_span_for_several_tasks_is_linked_to_each(chain: Chain, receiver: Rece
         vehicles.place(CARS, NEAR)
         first = wait_spans(receiver, "create task fuse", "reconcile fusion", "ready")
         vehicles.place(BUSES, NEAR)
-        # Each program sends its spans by itself: the manager's may come before those of the detector.
+        # Each program exports its own spans: the manager's may arrive before the detector's.
         second = wait_until(
             lambda: [each for each in receiver.spans() if each.trace != first["ready"].trace],
             lambda spans: {"create task fuse", "reconcile fusion", "ready"} <= {each.name for each in spans},
-            what="the second trace is there",
+            what="the second trace has arrived",
         )
     created, reconciled = (next(each for each in second if each.name.startswith(name)) for name in ("create", "recon"))
     assert first["reconcile fusion"].links == ()

@@ -1,4 +1,4 @@
-"""The use cases that deploy or reconfigure, on a real control plane: what runs at each of their scenario's moments.
+"""The use cases that deploy or reconfigure, on a real control plane: the applications at each moment of the scenario.
 
 The scenario is played to a running detector over Zenoh, up to a moment; then time stands still (`clock: Data`) until
 the cluster matches the scenario's own truth. So the speed of the machine does not matter: an overloaded detector skips
@@ -30,11 +30,11 @@ from tests.networks import session
 from tests.patience import PATIENCE
 from tests.ports import free_endpoint
 
-PACE = 2.5  # times as fast as it happens
-STEP_NS = SECOND // 20  # what is published at once
+PACE = 2.5  # times real time
+STEP_NS = SECOND // 20  # messages published at once
 DATA = {"clock": "Data", "lateness": "100ms"}
 SPARE = (-3, -2, -1)  # priorities: three levels of overload each
-WALL = {"clock": "Wall", "clientTimeout": "30m"}  # nobody is lost while the cluster is waited for
+WALL = {"clock": "Wall", "clientTimeout": "30m"}  # no client is lost while the test waits for the cluster
 
 
 @pytest.mark.parametrize("name", [each for each in use_cases() if scenario_of(each).moments])
@@ -62,12 +62,12 @@ def test_the_running_applications_match_the_scenario(
 def test_a_vehicle_is_never_without_its_application_while_that_moves_to_the_edge(
     api: Api, namespace: str, processes: Processes, tmp_path: Path
 ) -> None:
-    """At each look one of the two places serves, so the old one goes only after the new one is ready."""
+    """In each list one of the two places serves, so the old instance is removed only after the new one is ready."""
     name, cloud, edge = "edge-offloading", "car-1-cloud", "car-1-edge"
     scenario = scenario_of(name)
     endpoint = free_endpoint()
     holder = apply_use_case(api, name, endpoint, tmp_path, DATA)
-    # The promise is that of a linger longer than a start takes: here one for a slow machine.
+    # This is promised only for a linger longer than a start: here long enough for a slow machine.
     api.patch("ApplicationTemplate", "vision", {"spec": {"lifecycle": {"linger": "20s"}}})
     start_manager(processes, namespace)
     detector = processes.start("detector", "run", "--name", holder, "--namespace", namespace)
@@ -81,7 +81,9 @@ def test_a_vehicle_is_never_without_its_application_while_that_moves_to_the_edge
         with looking(lambda: places(api, cloud, edge)) as seen:
             player.play_until(after.at_s)
             wait_runs(api, after)
-            wait_until(lambda: places(api, cloud, edge), lambda there: there == {edge: True}, what="only the edge does")
+            wait_until(
+                lambda: places(api, cloud, edge), lambda there: there == {edge: True}, what="only the edge serves"
+            )
     assert [each for each in seen if not any(each.values())] == []
     assert seen[0] == {cloud: True}
     assert {cloud: True, edge: True} in seen
@@ -101,7 +103,7 @@ def places(api: Api, *keys: str) -> dict[str, bool]:
 
 @contextmanager
 def looking(look: Callable[[], dict[str, bool]]) -> Iterator[list[dict[str, bool]]]:
-    """Look again and again for the duration of a `with` block, and keep each state that differs from the last."""
+    """Read the state repeatedly for the duration of a `with` block; keep each state that differs from the last."""
     seen: list[dict[str, bool]] = []
 
     def keep() -> None:
@@ -114,7 +116,7 @@ def looking(look: Callable[[], dict[str, bool]]) -> Iterator[list[dict[str, bool
 
 
 def apply_use_case(api: Api, name: str, endpoint: str, folder: Path, clock: dict[str, str]) -> str:
-    """The use case's own files, but for where the detector listens and writes, and its clock. Gives its name."""
+    """Apply the use case's own files with another endpoint, folder and clock; return the holder's name."""
     holder, labels = "", {}
     for file in ("templates.yaml", "rules.yaml", "detector.yaml"):
         for document in yaml.safe_load_all((folder_of(name) / file).read_text(encoding="utf-8")):
@@ -136,11 +138,11 @@ def apply_use_case(api: Api, name: str, endpoint: str, folder: Path, clock: dict
 
 
 def wait_runs(api: Api, moment: Moment) -> None:
-    """Wait until exactly what must run at the moment does, with the configuration that it must have."""
+    """Wait until exactly the expected applications run, with the expected configuration."""
     wait_until(
         lambda: list(unlike(moment, running(api))),
         lambda problems: not problems,
-        what=f"what runs at {moment.at_s:g} s is what must",
+        what=f"the expected applications run at {moment.at_s:g} s",
     )
 
 
@@ -160,7 +162,7 @@ def running(api: Api) -> dict[str, RunningTask]:
 class Player:
     """Publishes a scenario's messages in order, up to a given time, slightly faster than real time.
 
-    Not as fast as they are taken: a detector that is flooded leaves out evaluations.
+    Not at full speed: an overloaded detector skips evaluations.
     """
 
     def __init__(self, endpoint: str, messages: list[Message], pace: float) -> None:
@@ -173,7 +175,7 @@ class Player:
 
     @contextmanager
     def playing(self) -> Iterator[Player]:
-        """Within this, somebody listens to all keys."""
+        """For the duration of the block, a subscriber receives all keys."""
         there = session(
             "peer",
             connect__endpoints=[self._endpoint],
@@ -187,12 +189,12 @@ class Player:
             wait_until(
                 lambda: [key for key, each in self._publishers.items() if not each.matching_status.matching],
                 lambda alone: not alone,
-                what="the detector listens to all keys",
+                what="the detector subscribes to all keys",
             )
             yield self
 
     def play_until(self, at_s: float) -> None:
-        """Publish all messages up to that second."""
+        """Publish all messages up to this second."""
         while self._next < len(self._messages) and self._messages[self._next].after_ns <= at_s * SECOND:
             message = self._messages[self._next]
             if message.after_ns >= self._pause_ns:
