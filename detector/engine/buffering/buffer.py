@@ -1,7 +1,7 @@
 """The samples of the last seconds, per client and stream, within a duration and a number of bytes.
 
-The cost of inserting does not depend on how much is stored: a sample is appended, and a late one moves only past those
-that are newer.
+The cost of an insertion does not depend on the size of the buffer: a sample is appended; a late sample is inserted
+before the newer ones.
 
 A sample becomes invisible when it is older than its duration; its memory is freed at the next whole second. Caps are
 enforced on each sample as it enters, so the contents depend neither on the batches in which samples arrive nor on the
@@ -20,10 +20,10 @@ from operator import attrgetter
 from detector.engine.samples.sample import SAMPLE_OVERHEAD, Item, Sample
 
 NEVER = -(2**63)
-"""Before all times: no sample has arrived yet."""
+"""A time before all others: no sample has arrived yet."""
 
 HOUSEKEEPING = 1_000_000_000
-"""Period in nanoseconds after which old samples are dropped; there is a tick for it, also without rules."""
+"""Period in nanoseconds after which old samples are dropped; each period has a tick, also without rules."""
 
 _RECEIVED = attrgetter("received")
 
@@ -40,8 +40,8 @@ class Lane:
     """The samples of one client on one stream, in time order."""
 
     __slots__ = (
-        "_pushed_out", "bytes", "capped", "client", "duration", "evicted", "inserted", "maximum_bytes", "maximum_count",
-        "number", "samples", "stream",
+        "_newest_evicted", "bytes", "capped", "client", "duration", "evicted", "inserted", "maximum_bytes",
+        "maximum_count", "number", "samples", "stream",
     )  # fmt: skip
 
     latched = False
@@ -61,11 +61,11 @@ class Lane:
         self.number = -1
         """The client's number in the tables (see columns/tables.py); -1 while it has none."""
         self.inserted: list[Sample] | None = None
-        """Samples inserted since `record`; None: they are not recorded."""
+        """Samples inserted since `record`; None: insertions are not recorded."""
         self.limit(duration, maximum_bytes, maximum_count)
         self.samples: deque[Sample] = deque()
         self.bytes = 0
-        self._pushed_out = NEVER
+        self._newest_evicted = NEVER
         """The time of the newest sample, if a cap evicted it."""
         self.evicted = 0
         """Samples that a cap evicted before they expired."""
@@ -75,14 +75,14 @@ class Lane:
         self.duration = duration
         self.maximum_bytes = maximum_bytes
         self.maximum_count = maximum_count
-        self._decide()
+        self._update_capped()
 
     def record(self, inserted: list[Sample] | None) -> None:
         """Append inserted samples to the list from now on, in order of arrival; None: stop."""
         self.inserted = inserted
-        self._decide()
+        self._update_capped()
 
-    def _decide(self) -> None:
+    def _update_capped(self) -> None:
         self.capped = self.maximum_bytes is not None or self.maximum_count is not None or self.inserted is not None
         """Whether samples must go through `insert`, which enforces the caps and fills `inserted`."""
 
@@ -94,7 +94,7 @@ class Lane:
     @property
     def latest(self) -> int:
         """The greatest time of all samples ever inserted, including evicted ones."""
-        return max(self.samples[-1].received, self._pushed_out) if self.samples else self._pushed_out
+        return max(self.samples[-1].received, self._newest_evicted) if self.samples else self._newest_evicted
 
     def insert(self, sample: Sample) -> int:
         """Insert the sample in time order; returns by how many bytes the lane grew."""
@@ -122,7 +122,7 @@ class Lane:
         """Drop the oldest sample; returns the bytes freed."""
         oldest = self.samples.popleft()
         if not self.samples:
-            self._pushed_out = max(self._pushed_out, oldest.time)
+            self._newest_evicted = max(self._newest_evicted, oldest.time)
         size = self.size_of(oldest)
         self.bytes -= size
         return size
@@ -136,14 +136,14 @@ class Lane:
         samples, horizon = self.samples, now - self.duration
         if not samples or samples[0].received > horizon:
             return 0
-        if len(samples) > 2 and samples[1].received > horizon:  # at low rates, one a second
+        if len(samples) > 2 and samples[1].received > horizon:  # usual at low rates: one sample expires
             return self.drop_oldest()
         freed = self._drop(bisect_right(samples, horizon, 0, len(samples) - 1, key=_RECEIVED))
         self.bytes -= freed
         return freed
 
     def _drop(self, count: int) -> int:
-        """Drop this number of the oldest samples; returns the bytes freed."""
+        """Drop the `count` oldest samples; returns the bytes freed."""
         pop = self.samples.popleft
         return sum([len(pop().payload) for _ in range(count)]) + SAMPLE_OVERHEAD * count
 
@@ -151,7 +151,7 @@ class Lane:
         """Time continues at the earlier time `to`: forget all samples, as if none had ever arrived."""
         self.samples.clear()
         self.bytes = 0
-        self._pushed_out = NEVER
+        self._newest_evicted = NEVER
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
         """The samples of (after, until], newest first; all up to `until` if `after` is None.
@@ -171,7 +171,7 @@ class ItemLane(Lane):
 
     __slots__ = ()
 
-    def _decide(self) -> None:
+    def _update_capped(self) -> None:
         """Every sample goes through `insert`."""
         self.capped = True
 
@@ -185,7 +185,7 @@ class ItemLane(Lane):
 
 
 class Buffer:
-    """All lanes, and the cap over them."""
+    """All lanes, and the cap on their total size."""
 
     def __init__(self, maximum_bytes: int) -> None:
         """`maximum_bytes` bounds the payloads and their overhead over all lanes."""
@@ -211,7 +211,7 @@ class Buffer:
         return (lane for client in clients for lane in self._lanes.get(client, {}).values())
 
     def add(self, lane: Lane) -> Lane:
-        """Add the lane; returns the existing one if there is one."""
+        """Add the lane, unless its client and stream already have one; returns the lane in the buffer."""
         lanes = self._lanes.setdefault(lane.client, {})
         if lane.stream not in lanes:
             lanes[lane.stream] = lane
@@ -233,7 +233,7 @@ class Buffer:
         for lanes in self._lanes.values():
             for lane in lanes.values():
                 samples = lane.samples
-                if samples and samples[0].received <= now - lane.duration:  # most are idle
+                if samples and samples[0].received <= now - lane.duration:  # most lanes are idle
                     self.bytes -= lane.expire(now)
 
     def latest(self, client: str) -> int:

@@ -19,29 +19,29 @@ class Presence:
 
     since: int
     last: int
-    """Or earlier: the buffer has newer samples."""
-    patience: int | None = None
-    """How long it is known without a sample, in nanoseconds; None: for the Detector's `clientTimeout`."""
+    """A lower bound: the buffer may have newer samples."""
+    timeout: int | None = None
+    """How long the client stays known without a sample, in nanoseconds; None: the Detector's `clientTimeout`."""
     restored: bool = False
-    """Whether nothing was received from it yet: it is known because an episode about it was restored."""
+    """Whether the client is known only from a restored episode: nothing was received from it yet."""
 
 
 class Clients:
     """The known clients and their labels."""
 
     def __init__(self, buffer: Buffer) -> None:
-        """`buffer` has their samples; `configure` follows."""
+        """`buffer` has the samples of the clients. Call `configure` before use."""
         self._buffer = buffer
         self._labels: Mapping[str, Mapping[str, str]] = {}
         self._timeout = 0
         self._expected: frozenset[str] = frozenset()
         self._present: dict[str, Presence] = {}
         self._sorted: list[str] | None = None
-        """Their names, sorted; None: to be sorted again, because a client was added or removed."""
+        """The sorted names of the known clients; None after a client was added or removed."""
         self.tokens = Tokens()
         self.newest = NEVER
-        """When the newest client became known, or later; nanoseconds."""
-        self._loss: int | None = NEVER
+        """An upper bound of the time at which the newest client became known; nanoseconds."""
+        self._next_timeout: int | None = NEVER
         """The earliest time at which a client can be lost by its timeout (nanoseconds); None: never in the current
         state."""
 
@@ -54,7 +54,7 @@ class Clients:
         """
         self._update_last()  # the buffer may drop streams
         self._labels, self._timeout = labels, timeout
-        self._loss = NEVER
+        self._next_timeout = NEVER
         for client in self._expected.difference(expected):
             self.still_present(client, now)
         self._expected = frozenset(expected)
@@ -64,23 +64,23 @@ class Clients:
                 self._sorted = None
                 self.newest = max(self.newest, now)
 
-    def note_presence(self, client: str, time: int, patience: int | None = None) -> None:
+    def note_presence(self, client: str, time: int, timeout: int | None = None) -> None:
         """Called with the first sample of the client on a stream, or its liveliness token.
 
-        `patience` (ns) is given for a stream with items: a client of several streams gets the longest of all.
+        `timeout` (ns) is given for a stream with items: a client of several streams gets the longest of all.
         """
         presence = self._present.get(client)
         if presence is None:
-            self._present[client] = Presence(time, time, patience)
+            self._present[client] = Presence(time, time, timeout)
             self._sorted = None
             self.newest = max(self.newest, time)
-            timeout = self._timeout if patience is None else patience
-            self._loss = NEVER if self._loss is None else min(self._loss, time + timeout)
+            deadline = time + (self._timeout if timeout is None else timeout)
+            self._next_timeout = NEVER if self._next_timeout is None else min(self._next_timeout, deadline)
         elif presence.restored:
-            presence.patience, presence.restored = patience, False
-            self._loss = NEVER
-        elif presence.patience is not None:
-            presence.patience = None if patience is None else max(patience, presence.patience)
+            presence.timeout, presence.restored = timeout, False
+            self._next_timeout = NEVER
+        elif presence.timeout is not None:
+            presence.timeout = None if timeout is None else max(timeout, presence.timeout)
         self.still_present(client, time)
 
     def restore(self, client: str, time: int) -> None:
@@ -97,20 +97,20 @@ class Clients:
 
     def may_remove(self, now: int) -> bool:
         """Whether `remove_lost` may find lost clients: a timeout expired, or a token was added or removed."""
-        if not self.tokens.changed and self._loss is not None and now > self._loss:
+        if not self.tokens.changed and self._next_timeout is not None and now > self._next_timeout:
             self._update_last()
-        return self.tokens.changed or (self._loss is not None and now > self._loss)
+        return self.tokens.changed or (self._next_timeout is not None and now > self._next_timeout)
 
     def _update_last(self) -> None:
         """Update when something was last received from each client, and the earliest time at which one can time out."""
         for name, presence in self._present.items():
             presence.last = max(presence.last, self._buffer.latest(name))
-        waited = (
+        deadlines = (
             presence.last + self._timeout_of(presence)
             for name, presence in self._present.items()
             if name not in self._expected and not self.tokens.has_token(name)
         )
-        self._loss = min(waited, default=None)
+        self._next_timeout = min(deadlines, default=None)
 
     def remove_lost(self, now: int) -> list[str]:
         """Remove the clients that have timed out without a token, or whose last token was dropped; returns them.
@@ -135,7 +135,7 @@ class Clients:
         return lost
 
     def _timeout_of(self, presence: Presence) -> int:
-        return self._timeout if presence.patience is None else presence.patience
+        return self._timeout if presence.timeout is None else presence.timeout
 
     def gap(self, time: int) -> None:
         """Nothing could be received up to `time`: timeouts count from there at the earliest."""

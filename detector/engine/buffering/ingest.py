@@ -1,4 +1,4 @@
-"""How a sample enters the buffer: which client sent it, and which lane stores it.
+"""Inserts samples into the buffer: finds the client and the lane of each sample.
 
 Keys and clients come from outside, so their number is bounded: a publisher that invents names costs no more memory than
 the bounds allow, and does not displace existing clients.
@@ -31,7 +31,7 @@ MAXIMUM_CLIENTS = 100_000
 """Maximum number of known clients; samples of further ones are dropped and counted."""
 
 MAXIMUM_OBJECTS = 50_000
-"""Maximum number of known clients up to which items add new ones: object lists leave room for vehicles."""
+"""Items add no new clients beyond this number of known clients: the rest is reserved for vehicles."""
 
 MAXIMUM_KEYS = 200_000
 """Maximum number of cached keys per stream; further keys are parsed each time, which is only slower."""
@@ -56,12 +56,12 @@ class Ingest:
         self._counters = counters
         self._number = 0
         self._newest = NEVER
-        """The greatest time of all samples until now: a sample with this time or a later one is late in no lane."""
+        """The greatest time of all samples until now: no sample with this time or a later one is late in any lane."""
         self.inserted: list[Sample] = []
-        """Samples inserted since tables were last updated, while `noting`."""
+        """Samples inserted since tables were last updated, while `collecting`."""
         self.lanes: list[Lane] = []
-        """The lane of each of these."""
-        self.noting = False
+        """The lane of each sample in `inserted`."""
+        self.collecting = False
         self.linked: frozenset[str] = frozenset()
         """The streams whose samples keep the previous one, because some rule reads it."""
         self._lost: dict[str, None] = {}
@@ -81,7 +81,7 @@ class Ingest:
         self._of_items = frozenset(stream.name for stream in detector.spec.streams if stream.items is not None)
         self._stale_after = {stream.name: detector.spec.stale_after_ns(stream) for stream in detector.spec.streams}
         timeout = detector.spec.client_timeout.ns
-        self._patience = {stream: min(self._stale_after[stream] or timeout, timeout) for stream in self._of_items}
+        self._item_timeouts = {stream: min(self._stale_after[stream] or timeout, timeout) for stream in self._of_items}
         """By stream with items, how long a client known only from such items stays known without one; nanoseconds."""
         self._lanes: dict[str, dict[str, Lane]] = {stream.name: {} for stream in detector.spec.streams}
         """By key; of streams whose messages name their client, by client: see `_lane_of_message`."""
@@ -89,7 +89,7 @@ class Ingest:
     def insert(self, arrivals: Sequence[Arrival], times: Sequence[int] | None, size: int) -> None:
         """Insert everything that was received.
 
-        `times`: None for the receive times, in order. `size`: an upper bound of the arrivals' size, see `size_of`.
+        `times`: None for the receive times, in order. `size`: an upper bound of the arrivals' memory, see `size_of`.
         """
         streams = {arrival.stream for arrival in arrivals}
         if len(streams) == 1:
@@ -115,7 +115,7 @@ class Ingest:
                     self._put(lane, arrival if times is None else StampedSample(time, self._number, payload, key))
 
     def size_of(self, arrivals: Sequence[Arrival]) -> int:
-        """The maximum memory that these take in the buffer, in bytes: their items take less."""
+        """An upper bound of the memory that the arrivals take in the buffer, in bytes; their items may take less."""
         size = bytes_of(arrivals)
         if self._of_items:
             size += MAXIMUM_ITEMS * SAMPLE_OVERHEAD * sum(arrival.stream in self._of_items for arrival in arrivals)
@@ -146,7 +146,7 @@ class Ingest:
 
     def _put(self, lane: Lane, sample: Sample) -> None:
         self._buffer.grew(lane.insert(sample))
-        if self.noting:
+        if self.collecting:
             self.inserted.append(sample)
             self.lanes.append(lane)
 
@@ -173,7 +173,7 @@ class Ingest:
                 lane.samples.append(arrival)
                 lane.bytes += len(arrival.payload) + SAMPLE_OVERHEAD
         buffer.bytes += size
-        if self.noting:
+        if self.collecting:
             self.inserted += arrivals
             self.lanes += lanes
 
@@ -241,16 +241,16 @@ class Ingest:
             if client is not None:
                 self._clients.still_present(client, time)  # the timeout counts from here
             return
-        whose = self._read_key(LIVELINESS, key)
-        if whose is None:
+        parsed = self._read_key(LIVELINESS, key)
+        if parsed is None:
             self._unnamed(LIVELINESS, key)
-        elif (whose[0] not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS) or not tokens.declare(
-            key, whose[0]
+        elif (parsed[0] not in self._clients and len(self._clients) >= MAXIMUM_CLIENTS) or not tokens.declare(
+            key, parsed[0]
         ):
             self._counters.crowded[LIVELINESS] += 1
         else:
-            self._lost.pop(whose[0], None)
-            self._clients.note_presence(whose[0], time)
+            self._lost.pop(parsed[0], None)
+            self._clients.note_presence(parsed[0], time)
 
     def _route(self, stream: str, key: str, time: int) -> Lane | None:
         """The lane for a key that is not cached: a new key, or one of a client that was lost."""
@@ -279,23 +279,23 @@ class Ingest:
             self._lanes[stream].clear()
         self._lanes[stream][key] = lane
         self._lost.pop(client, None)
-        self._clients.note_presence(client, time, self._patience.get(stream))
+        self._clients.note_presence(client, time, self._item_timeouts.get(stream))
         return lane
 
     def _read_items(self, stream: str, key: str, payload: bytes) -> dict[str, int]:
         """The clients of a message's items, and their indices in the list."""
-        whose = self._read_key(stream, key)
-        if whose is None:
+        parsed = self._read_key(stream, key)
+        if parsed is None:
             self._unnamed(stream, key)
             return {}
-        return self._message_clients.of_items(stream, key, whose[1], payload)
+        return self._message_clients.of_items(stream, key, parsed[1], payload)
 
     def _read(self, stream: str, key: str) -> str | None:
-        whose = self._read_key(stream, key) if stream in self._lane_makers else None
-        if whose is None:  # including messages of a stream that the Detector no longer has
+        parsed = self._read_key(stream, key) if stream in self._lane_makers else None
+        if parsed is None:  # including messages of a stream that the Detector no longer has
             self._unnamed(stream, key)
             return None
-        return whose[0]
+        return parsed[0]
 
     def _unnamed(self, stream: str, key: str) -> None:
         self._counters.unnamed[stream] += 1
@@ -304,8 +304,8 @@ class Ingest:
         )
 
     def _read_message(self, stream: str, key: str, payload: bytes) -> str | None:
-        whose = self._read_key(stream, key)
-        if whose is None:
+        parsed = self._read_key(stream, key)
+        if parsed is None:
             self._unnamed(stream, key)
             return None
-        return self._message_clients.client(stream, key, whose[1], payload)
+        return self._message_clients.client(stream, key, parsed[1], payload)

@@ -1,4 +1,4 @@
-"""Messages that are lists of objects: a stream's `items` names the list, and each item is a separate sample.
+"""Messages with lists of objects: a stream's `items` names the list, and each item is a separate sample.
 
 The samples share the message's payload. A message is decoded when it enters the buffer, to find its clients, and again
 soon afterwards, when rules read it. Therefore the newest messages are cached.
@@ -45,10 +45,10 @@ class Items:
         if listed is None:
             message = self._decoders[stream].decode(payload)
             listed = DecodedList(message, _list(*self._lists[stream], message))
-            self._keep(stream, payload, listed)
+            self._store(stream, payload, listed)
         return listed
 
-    def _keep(self, stream: str, payload: bytes, listed: DecodedList) -> None:
+    def _store(self, stream: str, payload: bytes, listed: DecodedList) -> None:
         self._bytes += len(payload)
         while self._bytes > _MAXIMUM_BYTES and self._cached:
             oldest = next(iter(self._cached))
@@ -58,7 +58,7 @@ class Items:
 
 
 def below(value: Any, path: Path) -> Any:
-    """The value at the path below a value; MISSING: there is none."""
+    """The value at the path below a value; MISSING if there is none."""
     for step in path:
         if isinstance(value, dict):
             value = value.get(step, MISSING)
@@ -70,7 +70,7 @@ def below(value: Any, path: Path) -> Any:
 
 
 def _list(expression: Expression, path: Path | None, message: Any) -> list[Any]:
-    """The list. A plain path is followed here, because CEL copies its results."""
+    """The list of items. A plain path is read without CEL, because CEL copies its results."""
     found = MISSING if path is None else below(message, path[1:])
     if isinstance(found, list):
         return found

@@ -1,6 +1,6 @@
 """Makes the lanes of each stream, within the limits that the Detector sets.
 
-In the lanes of a latched stream the last sample stays valid, however old, until it is replaced. The topic of a sample
+In the lanes of a latched stream the last sample stays valid at any age, until it is replaced. The topic of a sample
 is its key; for transforms (a /tf_static that several publishers share) the key and the frames. The newest sample of
 each topic is kept beyond the duration; caps evict it last of all.
 """
@@ -60,7 +60,7 @@ class LatchedLane(Lane):
         self._topics: dict[Sample, Hashable] = {}
         """The topics of samples, computed on first use; equal samples have equal topics."""
 
-    def _decide(self) -> None:
+    def _update_capped(self) -> None:
         """Every sample goes through `insert`."""
         self.capped = True
 
@@ -74,8 +74,8 @@ class LatchedLane(Lane):
         horizon = now - self.duration
         if not self.samples or self.samples[0].time > horizon:
             return 0
-        newest = {self._about(sample): sample for sample in self.samples}
-        return self._keep([s for s in self.samples if s.time > horizon or newest[self._about(s)] is s])
+        newest = {self._topic_of(sample): sample for sample in self.samples}
+        return self._keep([s for s in self.samples if s.time > horizon or newest[self._topic_of(s)] is s])
 
     def newest_first(self, after: int | None, until: int, now: int | None = None) -> Iterator[Sample]:
         """See Lane; excludes replaced samples that are older than the duration."""
@@ -84,17 +84,17 @@ class LatchedLane(Lane):
         for sample in reversed(self.samples):
             if after is not None and sample.time <= after:
                 return
-            about = self._about(sample)
-            if sample.time <= until and (sample.time > horizon or about not in replaced):
+            topic = self._topic_of(sample)
+            if sample.time <= until and (sample.time > horizon or topic not in replaced):
                 yield sample
-            replaced.add(about)
+            replaced.add(topic)
 
     def step_back(self, to: int) -> None:
         """Time continues at the earlier time `to`: samples stay valid; newer times become `to`."""
         self._keep([_not_after(sample, to) for sample in self.samples])
-        self._pushed_out = NEVER
+        self._newest_evicted = NEVER
 
-    def _about(self, sample: Sample) -> Hashable:
+    def _topic_of(self, sample: Sample) -> Hashable:
         """The topic of the sample."""
         if sample not in self._topics:
             self._topics[sample] = self._topic(sample.key, sample.payload)
@@ -104,7 +104,7 @@ class LatchedLane(Lane):
         """Keep only these samples; returns the bytes freed."""
         before = self.bytes
         self.samples = deque(samples)
-        self._topics = {sample: self._about(sample) for sample in samples}
+        self._topics = {sample: self._topic_of(sample) for sample in samples}
         self.bytes = bytes_of(samples)
         return before - self.bytes
 
@@ -139,7 +139,7 @@ class LaneMaker:
 
 
 def lane_makers(detector: Detector, decoders: Mapping[str, Decoder]) -> dict[str, LaneMaker]:
-    """One for each stream of the Detector; `decoders` has one for each as well."""
+    """A lane maker for each stream of the Detector; `decoders` has a decoder for each stream."""
     topics = latched_topics(detector, decoders)
     return {
         stream.name: LaneMaker(stream, detector.spec.buffer_duration_ns(stream), topics.get(stream.name))

@@ -14,7 +14,7 @@ from wayside.rules import CompiledStream
 _MISSING: Any = object()
 
 _RECEIVED = "sample.received"
-"""A stream's `stamp` if the receive time is used as the sender's: `t` of JSON lines."""
+"""The `stamp` of a stream that uses the receive time as the stamp: `t` of JSON lines."""
 
 _SECOND = 10**9
 """An integer: Python divides integers to the nearest double, where a double of nanoseconds would be 256 ns off."""
@@ -46,7 +46,7 @@ class Messages:
         self._counters = counters
         self._decoded: dict[tuple[str, Sample], Any] = {}
         self._stamps: dict[tuple[str, Sample], int | None] = {}
-        self._stamps_before: dict[tuple[str, Sample], int | None] = {}
+        self._previous_stamps: dict[tuple[str, Sample], int | None] = {}
         """The stamps read in the previous tick that read any: plugins read the same samples tick after tick."""
         self._last_stamp: tuple[tuple[str, int, bytes], int | None] | None = None
 
@@ -54,7 +54,7 @@ class Messages:
         """Drop the decoded messages: the tick is over."""
         self._decoded.clear()
         if self._stamps:
-            self._stamps_before, self._stamps = self._stamps, {}
+            self._previous_stamps, self._stamps = self._stamps, {}
 
     def content(self, stream: str, sample: Sample) -> Any:
         """The client's data: for a stream with `items` the item, otherwise the message; UNKNOWN as in `message`."""
@@ -64,7 +64,7 @@ class Messages:
         return self.items.read(stream, sample.payload).items[sample.place]
 
     def _before(self, stream: str, before: PreviousSample | None) -> Any:
-        """The client's previous data; UNKNOWN: there is none, or it cannot be read, which was counted before."""
+        """The client's previous data; UNKNOWN if there is none, or if it cannot be read (already counted)."""
         if before is None:
             return UNKNOWN
         if before.place >= 0:
@@ -75,7 +75,7 @@ class Messages:
             return UNKNOWN
 
     def message(self, stream: str, sample: Sample) -> Any:
-        """The decoded message of a sample, or UNKNOWN if it cannot be read; that is counted."""
+        """The decoded message of a sample; UNKNOWN, and counted, if the message cannot be read."""
         if isinstance(sample, Item):
             return self.items.read(stream, sample.payload).message  # it was readable on receipt
         at = (stream, sample)
@@ -112,8 +112,8 @@ class Messages:
             if before is not UNKNOWN:
                 values["before"] = before
         if "key" in names:
-            whose = self._read_key(stream, sample.key)
-            values["key"] = {} if whose is None else whose[1]
+            parsed = self._read_key(stream, sample.key)
+            values["key"] = {} if parsed is None else parsed[1]
         if "sample" in names:
             try:
                 stamp = self._stamp_of(stream, sample)
@@ -131,7 +131,7 @@ class Messages:
         at = (stream, sample)
         stamp: int | None = self._stamps.get(at, _MISSING)
         if stamp is _MISSING:
-            stamp = self._stamps_before.get(at, _MISSING)
+            stamp = self._previous_stamps.get(at, _MISSING)
             if stamp is _MISSING:
                 stamp = self.time(stream, sample.key, sample.received, sample.payload)
             self._stamps[at] = stamp
@@ -140,7 +140,7 @@ class Messages:
     def time(self, stream: str, key: str, received: int, payload: bytes) -> int | None:
         """A sample's time with clock Data, in nanoseconds: its stamp, or the receive time if it has none.
 
-        None if it cannot be read; that is counted.
+        None, and counted as unreadable, if the stamp cannot be read.
         """
         try:
             stamp = self._stamp(stream, payload, received)
@@ -151,7 +151,7 @@ class Messages:
         return received if stamp is None else stamp
 
     def _stamp_of(self, stream: str, sample: Sample) -> int | None:
-        """The same as `_stamp`; the stamp of a message with items is read once for all consecutive items."""
+        """The stamp of a sample, as in `_stamp`; consecutive items of one message share one read."""
         if not isinstance(sample, Item):
             return self._stamp(stream, sample.payload, sample.received)
         about = stream, sample.received, sample.payload
@@ -166,7 +166,7 @@ class Messages:
             near = self._near.get(stream)
             return decoder.stamp(payload) if near is None else near.stamp_near(payload, received)
         if expression.source.strip() == _RECEIVED:
-            return received  # exactly: as a double of seconds it would be rounded
+            return received  # a double of seconds would round it
         values: dict[str, Any] = {"sample": {"received": received / _SECOND}}
         if "msg" in expression.names:
             values["msg"] = decoder.decode(payload)

@@ -1,4 +1,4 @@
-"""The clients of a stream: which can have samples of it, and which a message names.
+"""The clients of a stream: those that can have samples of the stream, and those that a message names.
 
 A stream's `client` may be a template over the message, or over its items.
 

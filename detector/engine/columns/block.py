@@ -25,7 +25,7 @@ from wayside.expressions import UNKNOWN
 from wayside.expressions.columns.values import Column, value_at
 from wayside.rules import CompiledElement, CompiledRule
 
-_SUBJECTS = 100_000
+_MAXIMUM_SUBJECTS = 100_000
 """Maximum number of cached subjects of a rule."""
 
 
@@ -45,7 +45,7 @@ class Context(NamedTuple):
 
 
 class Track:
-    """A rule for one element of its `each`."""
+    """A rule, for one element of its `each`."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Track:
         """The subject of the client, or of the fleet."""
         subject = self._subjects.get(client)
         if subject is None:
-            if len(self._subjects) > _SUBJECTS:
+            if len(self._subjects) > _MAXIMUM_SUBJECTS:
                 self._subjects.clear()
             subject = self._subjects[client] = Subject(() if client == FLEET else (client,), self.element.name)
         return subject
@@ -86,7 +86,7 @@ class Block:
     def __init__(
         self, context: Context, ticks: Sequence[int], clients: Sequence[str], numbers: Integers | None = None
     ) -> None:
-        """`numbers` are those of the clients, if the caller knows them."""
+        """`numbers`: the numbers of the clients in the tables; None: look them up."""
         self.ticks = ticks
         self.times: Integers = np.array(ticks, np.int64)
         self.clients = clients
@@ -95,7 +95,7 @@ class Block:
         self.numbers: Integers = numbers
         self.signals: list[Column] = []
         self.fresh: dict[str, Truths] = {}
-        """By stream: whether it is fresh, at each point; shape (clients, ticks)."""
+        """By stream, whether the stream is fresh at each point; shape (clients, ticks)."""
         self.stale: set[str] = set()
         """The streams that are not fresh at some point."""
         self.latest: dict[str, Integers] = {}
@@ -139,7 +139,7 @@ class Block:
         return view
 
     def view(self, track: Track, point: int) -> dict[str, Any]:
-        """The same without the element."""
+        """The variables of expressions at a point, without those of the element."""
         client = self.clients[point // len(self.ticks)]
         return {
             "client": client,

@@ -29,7 +29,7 @@ class ClientValues:
         return self.of_client(track, path)
 
     def of_client(self, track: Track, path: Path) -> Hashable | Constant | None:
-        """The same for a path below the client itself, without the element."""
+        """The leaf of a path that starts at a variable of the client; None: no column represents it."""
         name = str(path[0])
         if name in track.signals:
             return ("signal", track.signals[name]) if len(path) == 1 else None

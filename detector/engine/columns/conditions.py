@@ -1,6 +1,6 @@
 """Conditions about clients, for rules that are evaluated together, as one program over the points of a block.
 
-CEL evaluates the rest, which the columns cannot represent or decide: once for each run of ticks with the same inputs.
+CEL evaluates the conditions and points that the columns cannot: once for each run of ticks with the same inputs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from wayside.rules import CompiledRule
 _OF_CLIENTS = frozenset({"client", "labels", "parameters"})
 """Variables that differ between clients."""
 
-_REMEMBERED = 100_000
+_MAXIMUM_CACHED = 100_000
 """Maximum number of clients whose last result of CEL is cached."""
 
 
@@ -36,7 +36,7 @@ class ClientCondition(NamedTuple):
     field: str
     expression: Expression
     node: int | None
-    """Its truth in the program; None: CEL evaluates it."""
+    """The node of its truth in the program; None: CEL evaluates the condition."""
     signals: tuple[int, ...]
     """Indices in the group of the signals that it reads."""
     streams: bool
@@ -51,11 +51,11 @@ class _Field(NamedTuple):
     has: Truths
     """Which tracks have it; shape (tracks, 1)."""
     rows: slice | list[int]
-    """The tracks whose condition is in the program."""
+    """The tracks whose condition the program evaluates."""
     nodes: tuple[int, ...]
-    """Their truths in the program."""
+    """The nodes of these conditions' truths in the program."""
     in_columns: list[tuple[int, ClientCondition, int]]
-    """The same tracks, with their conditions and nodes."""
+    """The tracks of `rows`, with their conditions and nodes."""
     by_cel: list[tuple[int, ClientCondition]]
     """The tracks whose condition CEL evaluates."""
 
@@ -119,14 +119,14 @@ class Conditions:
         found: dict[str, Ternary] = {}
         values, tags = stacked([self._client_values.at_points(block, each) for each in self._program.leaves], points)
         results = self._program.run(values, tags)
-        strange = tags is not None and bool((tags > Tag.NUMBER).any())
+        any_non_number = tags is not None and bool((tags > Tag.NUMBER).any())
         for field, these in self._by_field.items():
             true, false = found[field] = Ternary(np.zeros(shape, bool), np.zeros(shape, bool))
             if these.nodes:
                 true[these.rows], false[these.rows] = results.truths(these.nodes)
             for row, condition in these.by_cel:
                 self._evaluate_by_cel(block, row, condition, true[row], false[row])
-            for row, condition, node in these.in_columns if strange else ():
+            for row, condition, node in these.in_columns if any_non_number else ():
                 cel_rows = results.cel_rows(node)
                 if cel_rows is not None:
                     own = block.points(row)
@@ -150,7 +150,7 @@ class Conditions:
         changed[:, 0] = True
         for at in condition.signals:
             column = block.signals[at]
-            values = column.values.reshape(block.shape).view(np.int64)  # so that the sign of zero counts
+            values = column.values.reshape(block.shape).view(np.int64)  # compares bits: 0.0 and -0.0 differ
             changed[:, 1:] |= values[:, 1:] != values[:, :-1]
             if column.tags is not None:
                 tags = column.tags.reshape(block.shape)
@@ -188,7 +188,7 @@ class Conditions:
         if key is None or known is None or known[0] != key:
             value, note = condition.expression.explained(block.variables(track, point))
             known = (key, TRUE if value is True else FALSE if value is False else UNSURE, note)
-            if len(cache) > _REMEMBERED:
+            if len(cache) > _MAXIMUM_CACHED:
                 cache.clear()
             cache[client] = known
         _, result, note = known
@@ -220,13 +220,13 @@ class Conditions:
         points = np.flatnonzero(unknown if own is None else unknown & own)
         if not len(points):
             return
-        alike = np.zeros(len(points), np.int64)
+        groups = np.zeros(len(points), np.int64)
         for at in condition.signals:
             column = block.signals[at]
-            alike = alike * 8 + (Tag.NUMBER if column.tags is None else column.tags[points].astype(np.int64))
+            groups = groups * 8 + (Tag.NUMBER if column.tags is None else column.tags[points].astype(np.int64))
         if condition.by_client or self._context.possible.limited:
-            alike = alike * len(block.clients) + points // len(block.ticks)
-        kinds, inverse, counts = np.unique(alike, return_inverse=True, return_counts=True)
+            groups = groups * len(block.clients) + points // len(block.ticks)
+        kinds, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
         for kind in range(len(kinds)):
             point = block.last(points[inverse == kind])
             _, note = condition.expression.explained(block.variables(self._tracks[row], point))

@@ -1,6 +1,6 @@
-"""The values of signals at earlier evaluations, so that windows of signals over signals reach back beyond a block.
+"""The values of signals at earlier evaluations, for windows of signals over signals that start before a block.
 
-Values are kept by subject for the length of the window. The number of evaluations taken together changes no result.
+Values are kept by subject for the length of the window. The number of evaluations in a block changes no result.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Evaluations(NamedTuple):
     """The last tick of the block; nanoseconds, as all times."""
 
 
-class _Kept(NamedTuple):
+class _History(NamedTuple):
     """Values, by subject and then by time."""
 
     keys: Integers
@@ -43,7 +43,7 @@ class _Kept(NamedTuple):
     """Set if there are texts among them: their codes may not last."""
 
 
-_NOTHING = _Kept(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.uint8), None)
+_EMPTY = _History(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.uint8), None)
 
 
 class EarlierValues:
@@ -52,7 +52,7 @@ class EarlierValues:
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
         self._next = 1
-        self._kept: dict[tuple[str, str | None], _Kept] = {}
+        self._history: dict[tuple[str, str | None], _History] = {}
         self.version = 0
         """Changes when numbers of clients are no longer valid."""
 
@@ -76,20 +76,20 @@ class EarlierValues:
         return first << _SHIFT | second
 
     def clear(self) -> None:
-        """Windows reset: forget all values."""
-        self._kept.clear()
+        """Forget all values: the windows were reset."""
+        self._history.clear()
         self._numbers.clear()
         self.version += 1
 
     def forget_clients(self, clients: Collection[str]) -> None:
-        """Forget lost clients: if they return, earlier values do not count."""
+        """Forget lost clients: their earlier values do not count if they return."""
         gone = np.array([number for client in clients if (number := self._numbers.pop(client, None)) is not None])
         if not len(gone):
             return
         self.version += 1
-        for place, kept in self._kept.items():
+        for place, kept in self._history.items():
             stay = ~(np.isin(kept.keys >> _SHIFT, gone) | np.isin(kept.keys & _CLIENT, gone))
-            self._kept[place] = _of(kept, stay)
+            self._history[place] = _of(kept, stay)
 
     def window(
         self,
@@ -104,7 +104,7 @@ class EarlierValues:
         kind."""
         if not signal.needs_history:
             return column
-        rows = _joined(self._kept.get((signal.name, element), _NOTHING), now, column, texts)
+        rows = _joined(self._history.get((signal.name, element), _EMPTY), now, column, texts)
         low, high = _ranges(rows, now, signal)
         tags = None if (rows.tags == Tag.NUMBER).all() else rows.tags
         ranges = Ranges(rows.values, tags, rows.others, rows.times, low, high)
@@ -119,18 +119,18 @@ class EarlierValues:
         if found.tags is not None:
             counters.unknowns += int((found.tags == Tag.ABSENT).sum())
         reach = now.last - signal.lag_ns - signal.over_ns
-        self._kept[signal.name, element] = _of(rows, rows.times > reach)
+        self._history[signal.name, element] = _of(rows, rows.times > reach)
         return found
 
 
-def _of(kept: _Kept, rows: NDArray[np.bool_]) -> _Kept:
+def _of(kept: _History, rows: NDArray[np.bool_]) -> _History:
     if rows.all():
         return kept
     others = None if kept.others is None else kept.others[rows]
-    return _Kept(kept.keys[rows], kept.times[rows], kept.values[rows], kept.tags[rows], others)
+    return _History(kept.keys[rows], kept.times[rows], kept.values[rows], kept.tags[rows], others)
 
 
-def _joined(kept: _Kept, now: Evaluations, column: Column, texts: Texts) -> _Kept:
+def _joined(kept: _History, now: Evaluations, column: Column, texts: Texts) -> _History:
     """The earlier values, merged with the new ones."""
     order = np.argsort(now.keys, kind="stable")
     keys = now.keys[order]
@@ -148,7 +148,7 @@ def _joined(kept: _Kept, now: Evaluations, column: Column, texts: Texts) -> _Kep
     if others is not None or kept.others is not None:
         before = np.full(len(kept.keys), None, object) if kept.others is None else kept.others
         others = np.insert(before, at, np.full(len(keys), None, object) if others is None else others)
-    return _Kept(
+    return _History(
         np.insert(kept.keys, at, keys),
         np.insert(kept.times, at, now.times[order]),
         np.insert(kept.values, at, values),
@@ -157,7 +157,7 @@ def _joined(kept: _Kept, now: Evaluations, column: Column, texts: Texts) -> _Kep
     )
 
 
-def _ranges(rows: _Kept, now: Evaluations, signal: CompiledDerived) -> tuple[Integers, Integers]:
+def _ranges(rows: _History, now: Evaluations, signal: CompiledDerived) -> tuple[Integers, Integers]:
     """The window of each evaluation as a range of rows."""
     moments = np.unique(rows.times)
     changes = np.ones(len(rows.keys), bool)
@@ -173,7 +173,7 @@ def _ranges(rows: _Kept, now: Evaluations, signal: CompiledDerived) -> tuple[Int
 
 
 def _with_texts(column: Column, texts: Texts) -> Column:
-    """Give codes to texts that were kept without."""
+    """Replace texts in `others` by their codes."""
     if column.tags is None or column.others is None:
         return column
     for row in np.flatnonzero(column.tags == Tag.OTHER).tolist():

@@ -79,7 +79,7 @@ class SampleFields:
         return FoundFields([next(ready[str(path[0])]) for path in self._paths], errors, frozenset(odd))
 
     def _read_before(self, before: Sequence[PreviousSample | None], odd: set[int]) -> list[list[Any]]:
-        """The fields of the previous messages, if there are some and they can be read."""
+        """The fields of the previous messages; MISSING where there is none, or where it cannot be read."""
         there = [at for at, each in enumerate(before) if each is not None]
         fields = self._before([each.payload for each in before if each is not None])
         odd.update(there[at] for at in (*fields.odd, *fields.errors))
@@ -92,7 +92,7 @@ class SampleFields:
         return columns
 
     def _shared(self, samples: Sequence[Sample], texts: Texts, odd: set[int]) -> list[Column]:
-        """The fields of messages that several samples share, each read once. All of them were readable on receipt."""
+        """The fields of messages that several samples share. Each is read once; all were readable on receipt."""
         places: dict[bytes, int] = {}
         which = np.array([places.setdefault(sample.payload, len(places)) for sample in samples], np.int64)
         fields = self._messages([*places])
@@ -102,7 +102,7 @@ class SampleFields:
     def _walked(
         self, items: Sequence[tuple[bytes, int] | None], paths: Sequence[Path], odd: set[int]
     ) -> list[list[Any]]:
-        """The fields of items, given by their messages and their indices in them."""
+        """The fields of items; each item is given by its message and its index in the list."""
         lists: dict[bytes, list[Any]] = {}
         values: list[Any] = []
         for item in items:

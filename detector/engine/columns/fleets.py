@@ -43,7 +43,7 @@ class FleetCondition(NamedTuple):
 
     expression: Expression
     node: int | None
-    """Its truth over the ticks; None: CEL evaluates it."""
+    """The node of its truth over the ticks; None: CEL evaluates the condition."""
     folds: Mapping[str, tuple[FoldKind, int | None]]
     """By leaf, how it is folded, and the truth of its predicate over the points; None: all members count."""
 
@@ -106,7 +106,7 @@ class FleetGroup:
         self._outer = Program(self._of_ticks, [each.node for each in conditions if each.node is not None], texts)
 
     def number(self, subject: Subject) -> int:
-        """The number of a subject among the subjects of its rule and element: there is only one."""
+        """The number of a subject among those of its rule and element: always 0, because the fleet is the only one."""
         return 0
 
     def _condition(self, track: Track, field: str, expression: Expression) -> FleetCondition:

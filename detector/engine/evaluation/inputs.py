@@ -134,7 +134,7 @@ class RuleInputs:
         ingest = self.ingest
         self.tables.update(ingest.inserted, ingest.lanes)
         ingest.inserted, ingest.lanes = [], []
-        ingest.noting = not self.tables.empty
+        ingest.collecting = not self.tables.empty
 
     def forget_rows(self, now: int) -> None:
         """Drop table rows that are no longer needed, once a second: all ticks up to `now` (nanoseconds) have run."""
