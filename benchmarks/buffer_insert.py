@@ -46,7 +46,7 @@ def engine_holding(size: int) -> tuple[Engine, list[Arrival]]:
     engine = Engine(
         detector, holder="bench", decoders={"pose": Undecoded()}, read_key=lambda stream, key: ("car", {}), start=START
     )
-    # All within one period of the housekeeping, so that inserting is all that is measured.
+    # All within one period of the housekeeping, so that only inserts are measured.
     arrivals = [Arrival(START + 1 + i, "pose", "vehicles/car/pose", b"0" * 92) for i in range(size + INSERTS * ROUNDS)]
     engine.advance(arrivals[:size], START)
     return engine, arrivals[size:]

@@ -1,6 +1,6 @@
 """A changed configuration → seen in the running container, with and without the annotation that wakes the kubelet.
 
-A real node, the manager as a pod, one application that looks at its mounted file every 10 ms. From the request that
+A real node, the manager as a pod, one application that reads its mounted file every 10 ms. From the request that
 changes a task's parameter until the application has read the new value; both take the machine's clock. First with all
 of the manager's rights, then without the one to patch pods: then the kubelet, with Kubernetes' own settings, finds the
 new content by itself. Needs root. Exits with 1 where the median with the annotation misses its target.
@@ -85,12 +85,12 @@ def start(api: Api) -> Object:
     api.apply(_object("ApplicationTask", templateName=NAME, parameters={"number": 0}))
     apply_manager(api, WAYSIDE_IMAGE)
     wait_available(api, "application-manager")
-    api.wait_for("Deployment", NAME, lambda _: True, timeout=PATIENCE, what="the application is made")
+    api.wait_for("Deployment", NAME, lambda _: True, timeout=PATIENCE, what="the application is created")
     return wait_available(api, NAME)
 
 
 def change(node: Node, api: Api, pod: Object, number: int) -> float:
-    """Seconds from the change of the task to the time at which the container has read the new number."""
+    """Seconds from the change of the task until the container has read the new number."""
     time.sleep(random.uniform(0.0, 1.0))
     began = time.time()
     api.patch("ApplicationTask", NAME, {"spec": {"parameters": {"number": number}}})
@@ -105,7 +105,7 @@ def change(node: Node, api: Api, pod: Object, number: int) -> float:
 
 
 def forbid(api: Api) -> None:
-    """Take the right to patch pods from the manager, and no other."""
+    """Remove only the right to patch pods from the manager."""
     for role in api.list("Role"):
         rules: list[dict[str, Any]] = []
         for rule in role["rules"]:

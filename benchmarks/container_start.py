@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def measure(node: Node, api: Api, rounds: int) -> dict[str, list[tuple[float, float]]]:
-    """Seconds from the pod to its first process, and from that to the subscription, of each round by kind."""
+    """By kind, for each round: seconds from the pod to its first process, and from there to the subscription."""
     endpoint = f"tcp/{node.enclosure.outside}:{free_port()}"
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
@@ -93,7 +93,7 @@ def measure(node: Node, api: Api, rounds: int) -> dict[str, list[tuple[float, fl
 
 def _pod(spec: Object, command: list[str], name: str) -> Object:
     container = spec["containers"][0] | {"command": ["python3", "-c", STAMP, *command]}
-    if name == ZENOH:  # it has no health to ask for
+    if name == ZENOH:  # it has no health endpoint
         container = {key: value for key, value in container.items() if not key.endswith("Probe")}
     return {
         "apiVersion": "v1",
@@ -104,7 +104,7 @@ def _pod(spec: Object, command: list[str], name: str) -> Object:
 
 
 def _round(node: Node, api: Api, publisher: zenoh.Publisher, pod: Object) -> tuple[float, float]:
-    """Make the pod, wait until somebody subscribes, and remove it."""
+    """Create the pod, wait for its subscription, and delete it."""
     created = time.time()
     api.create(pod)
     deadline = time.monotonic() + PATIENCE

@@ -1,7 +1,7 @@
 """Start of a detector → its first subscription, compared with a minimal Zenoh program; the image's size.
 
-Ours: `detector run` with the cooperative-recording example, from its start until a publisher in this process sees that
-somebody subscribes to its key. The baseline: a Python program that opens a session and subscribes, seen the same way.
+Measured: `detector run` with the cooperative-recording example, from its start until a publisher in this process sees
+a subscription to its key. The baseline: a Python program that opens a session and subscribes, seen the same way.
 The two in turn. Exits with 1 where the median start misses its target.
 
     python -m benchmarks.detector_start [--rounds 5]
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def _until_subscribed(command: list[str], publisher: zenoh.Publisher) -> float:
-    """Seconds from the start of the program until the publisher has a listener; ends the program again."""
+    """Seconds from the start of the program until the publisher has a subscriber; ends the program afterwards."""
     with tempfile.TemporaryFile("w+") as log:
         began = time.monotonic()
         process = subprocess.Popen(command, stdout=log, stderr=log)

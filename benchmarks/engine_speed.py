@@ -49,7 +49,7 @@ TARGET = 500_000
 """Samples a second of a whole replay with fifty rules."""
 
 PLAIN_UP_TO = 5
-"""Rules: a window of its own for each of fifty would measure our EPL, not Esper."""
+"""Rules: a separate window for each of fifty would measure the EPL, not Esper."""
 
 
 class Message(msgspec.Struct):
@@ -98,7 +98,7 @@ def main() -> int:
 def measure(arrivals: Sequence[Arrival], rules: Sequence[EventRule], rounds: int) -> tuple[float, list[Event]]:
     """The median CPU time of a replay in seconds, without its set-up; and its events."""
     decode = msgspec.json.Decoder(Message).decode
-    replayed(arrivals[:1], speeds.detector(), rules)  # imports and caches are there when it counts
+    replayed(arrivals[:1], speeds.detector(), rules)  # warm up imports and caches
     spent: list[float] = []
     setups: list[float] = []
     baseline: list[float] = []

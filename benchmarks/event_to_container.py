@@ -3,7 +3,7 @@
 A real node with both programs as pods: two vehicles come close outside the cluster; from the startTime of the event
 until the container of the recorder runs. In turn with it, and by turns before and after it: from the start of `kubectl
 apply` of the very Deployment that the manager made, under another name, until its container runs; and the same with one
-bare request instead of kubectl, which is the least that anybody can take. One eye sees all ends, and looks every 20 ms.
+bare request instead of kubectl, the lower bound. One observer detects all ends and lists every 20 ms.
 The first round warms up and does not count. Needs root. Exits with 1 where the ratio of the medians misses its target.
 
     python -m benchmarks.event_to_container [--rounds 24]
@@ -37,9 +37,9 @@ sys.path.insert(0, str(EXAMPLE))
 from cooperative_recording.parked import ParkedVehicles
 from cooperative_recording.vehicles import LIDAR_VEHICLES
 
-TARGET = 1.2  # the most that an event may take in the middle, as a multiple of kubectl apply
+TARGET = 1.2  # the maximum of the median of events, as a multiple of that of kubectl apply
 PATIENCE = 300.0  # s
-LOOK = 0.02  # s between two looks
+LOOK = 0.02  # s between two lists
 WAIT = ["python3", "-c", "import time; time.sleep(10**6)"]
 EVENT, KUBECTL, REQUEST = "event", "kubectl apply", "one request"
 Seconds = dict[str, list[float]]
@@ -122,7 +122,7 @@ def _by_hand(node: Node, api: Api, made: Object) -> float:
 
 
 def _by_request(api: Api, made: Object) -> float:
-    """The same with one request of a client that is connected already."""
+    """The same with one request of a connected client."""
     manifest = _alike(made)
     began = time.time()
     api.apply(manifest)
@@ -152,7 +152,7 @@ def _running(api: Api) -> float:
 
 
 def _gone(api: Api) -> None:
-    what = "the recorder is gone"
+    what = "the recorder is removed"
     api.wait_list("Pod", lambda found: not found, what=what, labels="app.kubernetes.io/name=scene-recorder")
 
 

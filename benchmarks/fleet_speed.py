@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--ticks", type=int, default=30, help="that count (%(default)s)")
     options = parser.parse_args()
     rules = [rule(each, options.clients // 2) for each in speeds.limits(options.rules)]
-    measure(rules, options.clients, 2, watched=False)  # imports are done before it counts
+    measure(rules, options.clients, 2, watched=False)  # warm up the imports
     columns, events = measure(rules, options.clients, options.ticks, watched=False)
     one_by_one, expected = measure(rules, options.clients, options.ticks, watched=True)
     same = [each.to_json() for each in events] == [each.to_json() for each in expected]

@@ -35,14 +35,14 @@ from benchmarks.workloads import speeds
 from tests.ports import free_endpoint
 
 TARGETS = {1: 0.9, 2: 0.6}
-"""By number of publishers: of what the bare callback takes."""
+"""By number of publishers: the target as a fraction of the bare callback's rate."""
 
 PATIENCE = 30.0  # s until a publisher gives up on its subscriber
 PHASES = 1024
-"""Payloads of a client: its speed goes up and down once in as many."""
+"""The number of payloads in which a client's speed rises and falls once."""
 BARE, DETECTOR = "bare", "detector"
 MARK = "benchmark: "
-"""Begins the line of standard error with what a receiver found out."""
+"""The prefix of the line of standard error with a receiver's report."""
 
 
 class Run(NamedTuple):
@@ -138,7 +138,7 @@ def measure(receiver: str, publishers: int, options: argparse.Namespace) -> Run:
             process.kill()
             raise SystemExit(f"{receiver}: a publisher failed\n{tail(log_file.read_text())}")
         sent = [json.loads(output) for output in outputs]
-        time.sleep(1.0)  # what Zenoh has taken from the publishers must reach the receiver
+        time.sleep(1.0)  # samples that Zenoh accepted from the publishers must reach the receiver
         process.send_signal(signal.SIGTERM)
         process.wait(timeout=120)
         log = log_file.read_text()
@@ -204,7 +204,7 @@ def count(endpoint: str) -> None:
 
 
 def publish(endpoint: str, seconds: float, clients: Sequence[int]) -> None:
-    """Send the speeds of these clients as fast as they are taken."""
+    """Send the speeds of these clients as fast as the receiver accepts them."""
     config = settings(connect__endpoints=[endpoint], connect__timeout_ms=20_000, listen__endpoints=[])
     turn = 2 * math.pi / PHASES
     payloads = [b'{"speed": %.3f}' % (speeds.MEAN + speeds.SWING * math.sin(turn * phase)) for phase in range(PHASES)]
@@ -228,7 +228,7 @@ def publish(endpoint: str, seconds: float, clients: Sequence[int]) -> None:
                 put(payloads[(phase + shift) % PHASES])
             sent += len(pairs)
             now = time.monotonic()
-        time.sleep(0.5)  # closing the session would drop what it still holds
+        time.sleep(0.5)  # closing the session would drop its queued samples
     print(json.dumps({"count": sent, "begin": begin}))
 
 

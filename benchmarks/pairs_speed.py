@@ -48,7 +48,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.esper:
         esper.build()
-    measure(list(crowd.parts(100, 2)))  # imports and caches are there when it counts
+    measure(list(crowd.parts(100, 2)))  # warm up imports and caches
     same = True
     smallest: tuple[int, float] | None = None
     for clients in options.clients:

@@ -29,7 +29,7 @@ def mongodb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MongoServer]:
 
 @pytest.fixture
 def name() -> str:
-    """Of a database that no other test uses."""
+    """The URI of a database that no other test uses."""
     return f"t{uuid.uuid4().hex[:16]}"
 
 

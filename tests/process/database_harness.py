@@ -31,7 +31,7 @@ SPEEDS = "json/speed"
 
 
 class NoMessenger:
-    """No Zenoh: the action needs none."""
+    """A messenger without Zenoh, which the action does not need."""
 
     def publish(self, *_: Any) -> None:
         raise AssertionError("the database action publishes nothing")
@@ -124,7 +124,7 @@ class Harness:
 
 
 MakeHarness = Callable[..., Harness]
-"""The fixture `harness`: makes a harness, and closes it at the end of the test."""
+"""The fixture `harness`: creates a harness and closes it at the end of the test."""
 
 
 def numbers(database: Any, scenario: str = "e1.keep", collection: str = SPEEDS) -> list[float]:

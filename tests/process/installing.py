@@ -9,9 +9,9 @@ from pathlib import Path
 
 
 def installed(example: Path, folder: Path) -> Path:
-    """Install the example's package below the folder; return where its modules are."""
+    """Install the example's package below the folder; return the folder of its modules."""
     source, target = folder / "source", folder / "target"
-    shutil.copytree(example, source)  # building leaves files beside the sources
+    shutil.copytree(example, source)  # the build writes files beside the sources
     options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", target, source], check=True)
     return target

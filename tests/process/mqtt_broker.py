@@ -1,4 +1,4 @@
-"""A real MQTT broker in a process of its own, to be killed; and a publisher."""
+"""A real MQTT broker in a separate process that tests can kill, and a publisher."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PasswordPlugin(BaseAuthPlugin):
 
 @contextmanager
 def broker(port: int, *, guarded: bool = False, **listener: Any) -> Iterator[subprocess.Popen[str]]:
-    """The broker's process, ready to take connections; killed at the end."""
+    """The broker's process, ready to accept connections; killed at the end."""
     guard = {"tests.process.mqtt_broker.PasswordPlugin": {}}
     anyone = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
     config = {
@@ -55,7 +55,7 @@ def broker(port: int, *, guarded: bool = False, **listener: Any) -> Iterator[sub
 
 @contextmanager
 def publisher(port: int, tls: str | None = None) -> Iterator[Client]:
-    """A client that is connected, with a thread of its own."""
+    """A connected client with its own thread."""
     client = Client(CallbackAPIVersion.VERSION2, client_id="publisher")
     if tls is not None:
         client.tls_set(tls)

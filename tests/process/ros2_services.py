@@ -2,7 +2,7 @@
 
 There is no ROS 2 here. It reads requests and writes responses with rosbags, keeps to what rmw_zenoh's servers ask for
 (one declares its queryable as complete; a query without payload or attachment is not answered; a number that is still
-open is not taken twice), and has type hashes that were written down, not computed by what is tested.
+open is not taken twice), and has fixed type hashes that the tested code did not compute.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ HASHES = {
 }
 
 Serve = Callable[[Mapping[str, Any]], Mapping[str, Any] | None]
-"""Takes a request, gives the response; None: no answer."""
+"""Returns the response to a request; None: no answer."""
 
 
 class Node:
-    """Services on a session of its own."""
+    """Services on a separate session."""
 
     def __init__(self, session: zenoh.Session, *, bridged: bool = False, domain: int = 0) -> None:
         self._session = session
@@ -34,7 +34,7 @@ class Node:
         self._queryables: list[zenoh.Queryable[None]] = []
         self._changed = threading.Condition()
         self.calls: list[tuple[str, dict[str, Any]]] = []
-        """Name and request of each call, also of those that were not answered."""
+        """The name and request of each call, also of unanswered ones."""
         self.askers: set[bytes] = set()
         self.numbers: list[int] = []
 

@@ -35,7 +35,7 @@ class Process:
         self.name = "d"
 
     def write(self, *rules: Kind, streams: tuple[dict[str, Any], ...] = (), **spec: Any) -> None:
-        # However slowly all goes, no sample leaves its window and no client is lost.
+        # Even on a slow machine, no sample leaves its window and no client is lost.
         lasting = {"buffer": {"duration": "5m"}, "clientTimeout": "5m"}
         detector = a_detector(*streams, zenoh={"listen": [self.endpoint]}, **{**lasting, **spec})
         (self.folder / "detector.yaml").write_text(json.dumps(detector.to_json()))
@@ -55,12 +55,12 @@ class Process:
         )
 
     def status_when(self, true: Callable[[Status], bool]) -> Status:
-        """The status once it is as wanted."""
+        """The status, once `true` holds for it."""
         end, status = time.monotonic() + PATIENCE, None
         while time.monotonic() < end:
             try:
                 (answer,) = query_detectors(self.network, self.name, "status", {}, 5)
-            except (NoAnswerError, ValueError):  # it is just starting
+            except (NoAnswerError, ValueError):  # the detector is still starting
                 time.sleep(0.05)
                 continue
             status = read_status(answer.payload)
@@ -85,7 +85,7 @@ class Process:
         }
 
     def stop(self) -> int:
-        """End it as Kubernetes does; gives its exit code."""
+        """Stop the detector as Kubernetes does; return its exit code."""
         self.vehicle.close()  # type: ignore[no-untyped-call]
         self.process.terminate()
         return self.process.wait(PATIENCE)

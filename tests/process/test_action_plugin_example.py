@@ -21,7 +21,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "action-plugin"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the package is installed."""
+    """The folder with the installed package."""
     return installed(EXAMPLE, tmp_path_factory.mktemp("site"))
 
 

@@ -32,8 +32,8 @@ class Cli:
 sys.meta_path.insert(0, Cli())
 program.main()
 """
-"""The import of all the rest never ends; before it, a signal comes. That would be spared the first process of a
-container, or else end it by the signal itself."""
+"""The import of the other modules sends SIGTERM and then hangs. Without a handler, SIGTERM does not end the first
+process of a container, and ends any other process by the signal itself."""
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

@@ -29,7 +29,7 @@ def process(tmp_path: Path, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch)
 
 
 def tasks_in(folder: Path) -> list[dict[str, Any]]:
-    """The tasks in the folder, without unfinished files, whose names begin with a dot."""
+    """The tasks in the folder, without incomplete files, whose names begin with a dot."""
     return [
         task
         for path in folder.rglob("[!.]*.yaml")

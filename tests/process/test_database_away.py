@@ -20,7 +20,7 @@ from tests.process.running import Process
 from tests.recording_bench import mcap_files, read_with_mcap
 
 AWAY = 60.0
-"""Seconds, and at 100 Hz from two clients more than the memory has room for beside the smaller spool."""
+"""Seconds. At 100 Hz from two clients, this exceeds the memory and the smaller spool."""
 
 CLIENTS = ("car1", "car2")
 PADDING = "x" * 12_000
@@ -53,11 +53,11 @@ class RecordingDetector(Process):
         self.start()
 
     def episodes(self, kind: str) -> list[str]:
-        """Ids of those that have begun or ended."""
+        """The ids of the episodes that have started or ended."""
         return [each["data"]["episode"] for each in self.written() if each["type"].endswith(kind)]
 
     def at_rest(self, samples: int) -> list[str]:
-        """Ids of all episodes, once this number of samples was taken in, and their results are in the file."""
+        """The ids of all episodes, once this number of samples was received and their results are in the file."""
         status = self.status_when(lambda status: status.streams[0].samples == samples and not status.rules[0].open)
         self.events_when(2 * status.rules[0].started)
         begun = self.episodes("started")
@@ -68,7 +68,7 @@ class RecordingDetector(Process):
         return list(self.database["Scenarios"].find())
 
     def recorded(self) -> dict[str, list[tuple[str, float]]]:
-        """Keys and numbers of what the recordings have, by episode."""
+        """The keys and numbers of the recorded samples, by episode."""
         found = {}
         for reported in self.folder.glob("recordings/*/[!.]*/recording.json"):
             messages = [each for file in mcap_files(reported.parent) for each in read_with_mcap(file)]
@@ -77,7 +77,7 @@ class RecordingDetector(Process):
         return found
 
     def stored(self) -> dict[str, list[tuple[str, float]]]:
-        """The same of the documents, by scenario; read in one go, since the server reads all for each query."""
+        """The same for the documents, by scenario; in one query, since each query reads all documents."""
         found: dict[str, list[tuple[str, float]]] = {}
         for each in self.database["json/speed"].find({}, {"scenario": 1, "key": 1, "msg.n": 1}):
             found.setdefault(each["scenario"], []).append((each["key"], each["msg"]["n"]))
@@ -88,7 +88,7 @@ class RecordingDetector(Process):
 def pair(
     tmp_path: Path, proxy: ServerProxy, mongodb: MongoServer, database: Any, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[RecordingDetector, RecordingDetector]]:
-    """One with room for everything on its disk, one with little."""
+    """One detector with a spool for everything, and one with a small spool."""
     monkeypatch.setenv("TEST_MONGODB_URI", proxy.uri)
     client = database.client
     ample = RecordingDetector(tmp_path / "ample", client[f"{database.name}a"], "2Gi")
@@ -100,9 +100,9 @@ def pair(
 
 
 def drive(detectors: tuple[RecordingDetector, RecordingDetector], seconds: float) -> int:
-    """Each client's speed passes the threshold twice a second, for most of the time; then all stand.
+    """Each client's speed crosses the threshold twice a second for most of the time; then all stand still.
 
-    Gives how many samples each detector got.
+    Returns the number of samples that each detector received.
     """
     begin = time.monotonic()
     for number in range(int(seconds * 100)):

@@ -185,7 +185,7 @@ def test_a_spool_on_a_failing_disk_delays_nothing_and_continues_after_a_restart(
     queue = keep.action._writer._queue
     with queue._disk:
         assert queue._spool is not None
-        queue._spool._db.close()  # like a disk that is gone: each further request fails
+        queue._spool._db.close()  # like a removed disk: each further request fails
     second = keep.begin("e2")
     keep.take(second, speeds(1000))
     keep.finish(second)

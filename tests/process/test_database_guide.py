@@ -93,7 +93,7 @@ def test_errors_of_the_detectors_database_are_reported_by_field(
 
 
 def as_json(rule: dict[str, Any], database: str) -> EventRule:
-    """The example's rule, for JSON streams of the same names, and a database of the test's own."""
+    """The example's rule, for JSON streams of the same names and the test's own database."""
     spec = json.loads(json.dumps(rule["spec"]))
     for action in spec["actions"]:
         action["database"]["database"] = database

@@ -36,7 +36,7 @@ def process(tmp_path: Path, proxy: ServerProxy, monkeypatch: pytest.MonkeyPatch)
 
 
 def a_cloud() -> bytes:
-    """A message of about 1 MB, unlike any other."""
+    """A unique message of about 1 MB."""
     message = point_cloud(87_000)
     message.data[:] = np.frombuffer(os.urandom(message.data.size), np.uint8)
     return cdr(message)
@@ -75,11 +75,11 @@ def test_the_database_has_the_samples_that_the_recording_has(process: Process, n
         process.send("car2", {"v": 0, "n": number})
         if number % 30 == 0:
             process.send("car1", a_cloud(), "points")
-        if number in (100, 150):  # so that each rule sees it
+        if number in (100, 150):  # so that each rule evaluates it
             wanted = 1 if number == 100 else 2
             process.status_when(lambda status, wanted=wanted: sum(r.open for r in status.rules) == wanted)
     wait_until(lambda: [each["state"] for each in scenarios(database).values()] == ["Complete"] * 2, PATIENCE)
-    bags = process.folder / "recordings"  # each action has a thread of its own
+    bags = process.folder / "recordings"  # each action has its own thread
     wait_until(lambda: len(list(bags.glob("*/[!.]*/metadata.yaml"))) == 2, PATIENCE)
     for each in scenarios(database).values():
         assert each["metadata"] == {"who": "car1"}
@@ -117,11 +117,11 @@ def read_keys(file: Path) -> list[tuple[str, Any]]:
 
 
 BOUTS = (0, 20) * 5
-"""Speeds that pass the threshold again and again, so that there are many episodes; the last of them stays open."""
+"""Speeds that cross the threshold repeatedly, for many episodes; the last one stays open."""
 
 
 class Drive:
-    """Two clients that send a process their speeds, in samples with numbers from `first` on."""
+    """Two clients that send their speeds to a process, in samples numbered from `first`."""
 
     def __init__(self, process: Process, first: int = 0) -> None:
         self._process = process
@@ -136,7 +136,7 @@ class Drive:
                 self._number += 1
 
     def send_until(self, true: Callable[[RuleStatus], bool], *speeds: int) -> None:
-        """Send these until the rule is so: what comes while the detector stands still for a second starts nothing."""
+        """Send these until `true` holds for the rule: samples during a stall of a second start no episode."""
 
         def sent() -> bool:
             self.send(*speeds)
@@ -147,7 +147,7 @@ class Drive:
 
 
 def check(database: Any) -> int:
-    """The number of scenarios marked as complete; check that each of them is."""
+    """The number of scenarios marked as complete; checks that each one is complete."""
     complete = [each for each in scenarios(database).values() if each["complete"]]
     written: dict[str, list[float]] = {}
     for document in database["json/speed"].find():

@@ -19,7 +19,7 @@ RULES, DETECTOR, DRIVE = (EXAMPLE / name for name in ("rules.yaml", "detector.ya
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the package is installed."""
+    """The folder with the installed package."""
     return installed(EXAMPLE, tmp_path_factory.mktemp("site"))
 
 

@@ -49,11 +49,11 @@ def entered(self):
 Running.__enter__ = entered
 sys.exit(cli.main())
 """
-"""A detector that stands still while a file is there. No product would have this in it."""
+"""A detector that stalls while a file exists, as the product itself never does."""
 
 
 class Faulty(Process):
-    """`detector run` in which faults can be made."""
+    """`detector run` with injected faults."""
 
     def start(self, *options: str) -> None:
         (self.folder / "faulty.py").write_text(FAULTS)
@@ -68,7 +68,7 @@ class Faulty(Process):
             return 200, self.page(page)
         except urllib.error.HTTPError as error:
             return error.code, error.read().decode()
-        except OSError:  # it is just starting
+        except OSError:  # the detector is still starting
             return 0, ""
 
 
@@ -113,7 +113,7 @@ def test_an_absent_router_makes_the_detector_unready_but_keeps_it_live(faulty: F
     document["spec"]["zenoh"] = {"mode": "client", "connect": [endpoint]}
     (tmp_path / "detector.yaml").write_text(json.dumps(document))
     faulty.start()
-    # On a machine that is busy enough, the evaluation itself may once be late by the second that is allowed here.
+    # On a busy machine, a normal evaluation may also be late by the second that is allowed here.
     wait_for(has(faulty, "/readyz", 503, "no Zenoh session yet"))
     wait_for(has(faulty, "/healthz", 200, "the last evaluation"))
     with router_process(endpoint):

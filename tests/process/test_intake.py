@@ -12,7 +12,7 @@ from tests.patience import PATIENCE
 
 
 class Clock:
-    """A clock that a test sets; it may stand still and go back."""
+    """A clock that the test sets; it may stop and go back."""
 
     def __init__(self, now: int) -> None:
         self.now = now
@@ -48,9 +48,9 @@ def test_concurrent_producers_get_monotonic_receive_times_in_queue_order() -> No
     assert len(times) == 16_000
     assert all(first <= second for first, second in itertools.pairwise(times))
     for count, until in boundaries:
-        assert all(received > until for received in times[count : count + 1])  # and so are those behind it
+        assert all(received > until for received in times[count : count + 1])  # and the samples after it
         assert count == 0 or all(received > times[count - 1] for received in times[count : count + 1])
-    for index in range(8):  # and each publisher's own order is kept
+    for index in range(8):  # the order of each publisher is kept
         own = [arrival.key for arrival in arrivals if arrival.stream == f"s{index}"]
         assert own == [f"k/{number}" for number in range(2_000)]
 
@@ -139,7 +139,7 @@ def test_all_samples_of_a_message_share_its_time() -> None:
         (101, "s", "b"),
         (101, "t", "b"),
     ]
-    assert intake.dropped == 2  # the samples of c
+    assert intake.dropped == 2  # client c's samples
 
 
 def test_a_lossless_put_waits_for_room_up_to_a_timeout() -> None:

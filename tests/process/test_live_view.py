@@ -47,7 +47,7 @@ ALONE = a_rule(
     when="age > 100",
     evaluation={"every": "100ms"},
 )
-"""It is not in columns."""
+"""A condition that cannot be evaluated in columns."""
 SUBJECTS = {
     *(f"/wayside/fast/{car}" for car in ("car1", "car2")),
     *(f"/wayside/aged/{car}" for car in ("car1", "car2")),
@@ -63,7 +63,7 @@ class Shown(NamedTuple):
 
 
 class Viewer:
-    """Speaks the protocol with nothing but a WebSocket."""
+    """A client of the protocol that uses only a WebSocket."""
 
     def __init__(self, port: int) -> None:
         self._socket: ClientConnection = connect(f"ws://127.0.0.1:{port}", subprotocols=[PROTOCOL])
@@ -75,7 +75,7 @@ class Viewer:
         self._socket.close()
 
     def take(self, timeout: float = 0.05) -> None:
-        """The next message, where one comes in time."""
+        """Receive the next message, if one arrives in time."""
         try:
             message = self._socket.recv(timeout)
         except TimeoutError:
@@ -128,7 +128,7 @@ def drive(watched: Watched, viewer: Viewer, done: Any) -> None:
 
 
 def listens_on(port: int) -> set[str]:
-    """The addresses at which this port is served; hexadecimal, as the kernel has them."""
+    """The addresses on which this port is served, in the kernel's hexadecimal form."""
     found = set()
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
@@ -173,5 +173,5 @@ def test_the_live_view_shows_the_results_of_the_replay(watched: Watched) -> None
 
 
 def plain(message: dict[str, Any]) -> dict[str, Any]:
-    """Without the reasons: these contain ages."""
+    """The message without the reasons, which contain ages."""
     return {name: value for name, value in message.items() if not name.endswith("_reason")}

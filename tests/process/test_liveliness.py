@@ -147,7 +147,7 @@ def test_tokens_are_followed_over_the_network(endpoint: str, arrivals: Arrivals,
 
     with router(listen__endpoints=[endpoint]):
         car1, car2 = vehicle(endpoint), vehicle(endpoint)
-        kept = car1.liveliness().declare_token("alive/car1")  # a token that nothing refers to is withdrawn
+        kept = car1.liveliness().declare_token("alive/car1")  # Zenoh undeclares a token without references
         token = car2.liveliness().declare_token("alive/car2")
         arrivals.wait_for(
             lambda seen: sorted(seen) == report(("car1", TokenState.DECLARED), ("car2", TokenState.DECLARED))

@@ -46,7 +46,7 @@ def test_the_manager_reconnects_with_the_new_certificate_when_the_old_one_expire
         kept = network.declare_subscriber(
             "wayside/**", lambda sample: heard.append((time.time(), sample.payload.to_string()))
         )
-        authority.mount(mounted, "manager", lasting=SHORT)  # not before all is there that it must last for
+        authority.mount(mounted, "manager", lasting=SHORT)  # issued last, since it soon expires
         publisher = Publisher(settings([str(tmp_path / "zenoh.json5")]))
         over, going = threading.Event(), threading.Event()
 

@@ -34,7 +34,7 @@ from tests.fleets import HARSH, write_fleet, write_mcap
 from tests.patience import PATIENCE
 from wayside.process import commandline
 
-pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all
+pytestmark = pytest.mark.xdist_group("mining")  # one fleet for all tests
 
 RECORDINGS, BROKEN = 6, 3
 
@@ -54,7 +54,7 @@ def command(folder: Path, output: str, *options: str, rules: str = "rules.yaml",
 
 
 def mine(folder: Path, output: str, *options: str, **more: Any) -> str:
-    """Runs it here, with processes of its own; what it prints."""
+    """Run the command in this process, with its own worker processes; return its output."""
     logged = io.StringIO()
     with contextlib.chdir(folder), contextlib.redirect_stderr(logged):
         commandline.run_cli(app, "detector", (), command(folder, output, *options, **more)[3:])
@@ -227,7 +227,7 @@ def test_a_worker_that_is_killed_changes_nothing(fleet: Path) -> None:
 
 
 def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) -> None:
-    # A local cluster gives up a worker that is not back in time, and a busy machine starts it slowly.
+    # A local cluster drops a worker that does not restart in time, and a busy machine starts it slowly.
     back = dask.config.set({"distributed.deploy.lost-worker-timeout": PATIENCE})
     with back, LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         calls = [RemoteCall(end_once, str(fleet / "ended"))] + [RemoteCall(end, number) for number in range(3)]
@@ -241,7 +241,7 @@ def test_a_dask_cluster_of_which_a_worker_is_killed_gives_the_same(fleet: Path) 
 
 
 def end_once(path: str) -> int:
-    """Ends the process that calls it first."""
+    """Ends the first process that calls it."""
     if not Path(path).exists():
         Path(path).touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -275,7 +275,7 @@ def test_recordings_behind_urls_are_mined_like_local_files(fleet: Path, monkeypa
 
 @contextlib.contextmanager
 def serving(folder: Path) -> Iterator[str]:
-    """A web server of the folder; its address."""
+    """Serve the folder over HTTP; yields the address."""
 
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None:
@@ -288,13 +288,13 @@ def serving(folder: Path) -> Iterator[str]:
 
 
 def workers_of(process: int) -> list[int]:
-    """The processes that it spawned to work."""
+    """Its worker processes."""
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
     return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def end(number: int) -> int:
-    """Ends the process that calls it, for one of the numbers."""
+    """Ends the calling process for one of the numbers."""
     if number == 3:
         os.kill(os.getpid(), signal.SIGKILL)
     return number

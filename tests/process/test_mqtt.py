@@ -44,7 +44,7 @@ def mqtt(
 
 
 def publish_until(client: Client, topic: str, done: Callable[[], object]) -> None:
-    """The first messages may be sent before the subscription is there."""
+    """The first messages may be sent before the subscription exists."""
     deadline = time.monotonic() + PATIENCE
     while not done():
         assert time.monotonic() < deadline
@@ -55,7 +55,7 @@ def publish_until(client: Client, topic: str, done: Callable[[], object]) -> Non
 def test_messages_arrive_on_their_keys_also_after_the_broker_was_killed(port: int, arrivals: Arrivals) -> None:
     loss_counter = LossCounter()
     with mqtt(arrivals, loss_counter, port=port) as thread:
-        for client in ("car1", "car2"):  # at first there is no broker yet
+        for client in ("car1", "car2"):  # no broker runs yet
             wait_for(lambda: thread.state is SourceState.PAUSING)
             with broker(port), publisher(port) as sender:
                 publish_until(sender, f"vehicles/{client}/pose", lambda: client in str(arrivals.seen))  # noqa: B023
@@ -108,10 +108,10 @@ def test_with_a_client_id_the_broker_keeps_messages_while_the_detector_is_away(
     (tmp_path / "password").write_text(PASSWORD + "\n")
     credentials = {"username": "detector", "passwordFile": str(tmp_path / "password")}
     given = {"port": port, "clientId": "detector", "qos": 1, "credentials": credentials}
-    with broker(port, guarded=True), publisher(port) as client:  # this broker keeps nothing for who has no name
+    with broker(port, guarded=True), publisher(port) as client:  # this broker keeps no messages for unnamed clients
         with mqtt(arrivals, LossCounter(), **given):
             publish_until(client, "vehicles/car1/pose", lambda: arrivals.seen)
-        # What comes before this broker has noticed that the detector is away goes to the old connection, and is lost.
+        # Until the broker notices the detector's disconnection, it sends messages to the old connection: they are lost.
         for number in itertools.count():
             client.publish("vehicles/car1/pose", b"meanwhile", qos=1).wait_for_publish(PATIENCE)
             with mqtt(arrivals, LossCounter(), **given):

@@ -54,7 +54,7 @@ def network(arrivals: Arrivals, **config: Any) -> Iterator[Network]:
 
 
 def flows(source: zenoh.Session, arrivals: Arrivals, payload: Any = "x", within: float = PATIENCE) -> bool:
-    """Whether what is put arrives."""
+    """Whether a put sample arrives."""
     deadline = time.monotonic() + within
     while not arrivals.seen:
         if time.monotonic() > deadline:
@@ -114,7 +114,7 @@ def test_a_peer_listens_with_tls_and_requires_certificates(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Here everything comes from a Secret's folder."""
+    """Here all files are in a Secret's folder."""
     at = over_tls(endpoint)
     monkeypatch.setenv("WAYSIDE_SECRETS", str(tmp_path))
     certificate, key = authority.sign("both")

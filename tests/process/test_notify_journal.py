@@ -29,7 +29,7 @@ sys.stdin.read()
 
 
 def test_events_journalled_before_a_kill_are_delivered_once_after_it(tmp_path: Path) -> None:
-    with endpoint(hangs()) as there:  # so that nothing else is on its way when the process ends
+    with endpoint(hangs()) as there:  # no other request is in progress when the process ends
         process = subprocess.Popen(
             [sys.executable, "-c", _KILLED, there.url, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )

@@ -88,7 +88,7 @@ def test_an_alert_continues_after_a_kill_with_its_labels(tmp_path: Path) -> None
         process.start()
         process.send("car1", {"v": 20})
         (first,) = events(there.received(1))[0]
-        # A kill costs what the state volume does not have yet.
+        # A kill loses events that are not yet on the state volume.
         wait_until(
             lambda: any(first["labels"]["episode"] in each.read_text() for each in tmp_path.glob("state/*.json"))
         )

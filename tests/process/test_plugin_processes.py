@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("plugins")
 
 
 class Clock:
-    """Time for pauses between starts, as the test wants it."""
+    """The clock for the pauses between starts, which the test sets."""
 
     now = 0.0
 
@@ -78,7 +78,7 @@ def test_a_plugin_that_exits_is_reported_and_the_others_continue(host: ProcessHo
     counters = drive.engine.counters.rule("r")
     assert counters.errors == 1
     assert counters.last_error.startswith("signal p: plugin counting: its process exited; stopped")
-    assert counters.unknowns == 3 + 4  # the signal's, and those of the condition
+    assert counters.unknowns == 3 + 4  # the error of the signal, and those of the condition
 
 
 def test_a_hanging_plugin_is_stopped_and_reported(caplog: pytest.LogCaptureFixture) -> None:
@@ -86,7 +86,7 @@ def test_a_hanging_plugin_is_stopped_and_reported(caplog: pytest.LogCaptureFixtu
         drive = PluginDrive(a_detector(), plugin_rule("r", parameters={"hangAt": 7}), plugin_rule("z"), host=host)
         drive.take(arrival(0.5, "a", {"v": 1}), until=1)
         process = host._signals["r", "p"]._process
-        host._patience = 5.0  # the other one, too, must answer within it
+        host._patience = 5.0  # the other plugin must also answer within it
         assert drive.take(arrival(1.5, "a", {"v": 7}), until=2) == []
         host._patience = PATIENCE
         assert drive.take(until=4) == ["z a started 3"]
@@ -111,7 +111,7 @@ def test_a_live_plugin_is_restarted_up_to_three_times_with_a_pause() -> None:
 
 
 def wait_for_it(host: ProcessHost, drive: PluginDrive, seconds: int) -> None:
-    """Evaluate until the plugin gives values; the process starts while we do."""
+    """Evaluate until the plugin returns values; its process starts meanwhile."""
     drive.take(arrival(seconds + 0.5, "a", {"v": 1}), until=seconds + 1)
     assert host._signals["r", "p"].is_ready(PATIENCE, again=False)
 
@@ -152,7 +152,7 @@ def test_removing_a_rule_stops_its_plugin_process(host: ProcessHost) -> None:
 
 
 def test_the_shipped_plugin_loads_its_dependencies_before_its_first_call() -> None:
-    """A value must be there within half a second; loading scipy takes longer than that."""
+    """A value must be returned within half a second; importing scipy takes longer."""
     program = """
         import sys
         from detector.plugins.instances import Instances

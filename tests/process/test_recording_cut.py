@@ -100,7 +100,7 @@ def test_the_recording_of_a_killed_process_is_recovered_and_marked(tmp_path: Pat
     bench = recovered(tmp_path)
     names = sorted(each.name for each in (tmp_path / "r").iterdir())
     assert [name.split("_")[4:] for name in names] == [["episode1"], ["episode2", "cut"]]
-    assert not other.exists()  # nothing of it had been written but what is known anyway
+    assert not other.exists()  # no sample of it had been written
     assert read_with_rosbags(tmp_path / "r" / names[0])
     cut = tmp_path / "r" / names[1]
     found = {each for file in mcap_files(cut) for each in read_with_mcap(file)}
@@ -116,7 +116,7 @@ def test_the_recording_of_a_killed_process_is_recovered_and_marked(tmp_path: Pat
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
-    """A file of small chunks, and where each of them ends."""
+    """A file of small chunks, and the offset of each one's end."""
     bench = Bench(tmp_path_factory.mktemp("whole"))
     bench.action.started(an_episode())
     for first in range(0, len(SAMPLES), 40):
@@ -138,7 +138,7 @@ def test_a_truncated_file_gives_all_chunks_before_the_cut(whole: tuple[Path, lis
     path = file.with_name("cut.mcap")
     shutil.copy(file, path)
     os.truncate(path, cut)
-    if data.draw(st.booleans()) and cut > 200:  # a block that the disk never had
+    if data.draw(st.booleans()) and cut > 200:  # a block that never reached the disk
         with path.open("r+b") as stream:
             stream.seek(cut - 10)
             stream.write(bytes(10))
@@ -182,7 +182,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def somebody_else_fills_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between the look at the free room and the write."""
+    """Between the check of the free space and the write."""
     monkeypatch.setattr(Destination, "_free", lambda self: 10**12)
 
 
@@ -292,7 +292,7 @@ def test_a_slow_disk_drops_and_counts_samples_and_delays_nothing(
     for sample in points:
         worker.enqueue(RunSamples(run, [sample]))
     worker.enqueue(RunCompleted(run))
-    assert time.monotonic() - begin < PATIENCE / 2  # the disk stands still for twice as long
+    assert time.monotonic() - begin < PATIENCE / 2  # the disk stalls for twice as long
     proceed.set()
     worker.request_close()
     assert worker.join(PATIENCE)

@@ -48,7 +48,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
 
 
 def named(folder: Path, rule: str, count: int) -> list[Path]:
-    """The recordings of a rule, once there is this number of them."""
+    """The recordings of a rule, once this number of them exist."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         found = [each for each in folder.glob(f"recordings/{rule}/*") if not each.name.startswith(".")]
@@ -59,7 +59,7 @@ def named(folder: Path, rule: str, count: int) -> list[Path]:
 
 
 def until_evaluated(process: Process, speed: float) -> None:
-    """The rule has looked at this speed."""
+    """Wait until the rule has evaluated this speed."""
     end, seen = time.monotonic() + PATIENCE, []
     while seen != [speed]:
         assert time.monotonic() < end, seen

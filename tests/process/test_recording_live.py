@@ -33,7 +33,7 @@ STREAMS = (
     a_stream("points", encoding="cdr", type="sensor_msgs/msg/PointCloud2"),
 )
 POINTS = CdrDecoder("sensor_msgs/msg/PointCloud2")
-CLOUD = cdr(point_cloud(83_000))  # 1 MB; its stamp stands at 4:12
+CLOUD = cdr(point_cloud(83_000))  # 1 MB; its stamp is in bytes 4:12
 BEFORE, AFTER = 0.7, 0.5
 
 
@@ -51,17 +51,17 @@ TURNS = {100: (0, 0), 150: (1, 0), 200: (1, 1), 240: (0, 1), 260: (0, 0), 300: (
 
 
 class Vehicle(threading.Thread):
-    """Sends 100 messages a second and 10 clouds of 1 MB; every tenth message is overtaken by the next.
+    """Sends 100 messages a second and 10 clouds of 1 MB; every tenth message arrives after the next one.
 
-    Its course is as long as `duration`. At a turn it continues as before until it is released: however late all is on a
-    busy machine, what it does was seen.
+    Its course has length `duration`. At a turn it continues as before until it is released, so the detector sees each
+    step even on a slow machine.
     """
 
     def __init__(self, process: Process, name: str, duration: float, *, turns: bool = False) -> None:
         super().__init__(daemon=True)
         self._process, self._name, self._duration = process, name, duration
         self.sent: list[tuple[int, str, bytes]] = []
-        """Stamp, key and payload."""
+        """The stamp, key and payload."""
         self.free = 0 if turns else 2**31
         """The turn up to which it is released."""
 
@@ -120,7 +120,7 @@ def finished(process: Process, count: int) -> list[Path]:
 
 
 def follow(process: Process, *vehicles: Vehicle) -> None:
-    """Lets the vehicles take each turn once the detector has seen what they did until then; returns at their end."""
+    """Releases each turn of the vehicles once the detector has seen the previous step; returns at their end."""
     for turn, over in TURNS.items():
         wanted = {name: len(vehicles) * is_over for name, is_over in zip(("v-rule", "w-rule"), over, strict=True)}
         process.status_when(
@@ -133,7 +133,7 @@ def follow(process: Process, *vehicles: Vehicle) -> None:
 
 
 def until_written(process: Process, payload: bytes) -> None:
-    """The kernel has this of a recording in progress, and with it what came before; they are not compressed."""
+    """Wait until this payload, and so all data before it, is written to a recording in progress (uncompressed)."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         if any(payload in each.read_bytes() for each in process.folder.glob("recordings/*/.*/*.mcap")):
@@ -143,7 +143,7 @@ def until_written(process: Process, payload: bytes) -> None:
 
 
 def stored(process: Process, database: Any, scenario: dict[str, Any]) -> list[Recorded]:
-    """The stored documents of a scenario; a cloud only by its points, from its file."""
+    """The stored documents of a scenario; of a cloud only the points, from its file."""
     found = []
     for collection in scenario["messages"]:
         for document in database[collection].find({"scenario": scenario["_id"]}):
@@ -157,7 +157,7 @@ def stored(process: Process, database: Any, scenario: dict[str, Any]) -> list[Re
 
 
 def as_stored(message: Recorded) -> Recorded:
-    """The same of a message that was recorded: whole numbers are doubles in the database."""
+    """The same for a recorded message: whole numbers are doubles in the database."""
     if message.topic.endswith("points"):
         return message._replace(payload=POINTS.decode(message.payload)["data"])
     values = json.loads(message.payload)
@@ -177,7 +177,7 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
     }
     write(process, recording("v-rule", "v > 0", name), recording("w-rule", "w > 0", name), **spec)
     process.start("--record-intake", "intake")
-    # With clock Data, the stamps alone count: it does not matter how late a sample is looked at.
+    # With clock Data, only the stamps count: a late evaluation does not matter.
     duration = 7.5 if clock == "Data" else 4.5
     vehicles = [Vehicle(process, name, duration, turns=clock == "Wall") for name in ("car1", "car2")]
     for vehicle in vehicles:
@@ -186,7 +186,7 @@ def test_overlapping_episodes_have_exactly_their_samples_in_recordings_and_in_th
         follow(process, *vehicles)
     for vehicle in vehicles:
         vehicle.join()
-    bags = finished(process, 6)  # of each vehicle two episodes of v, one of w
+    bags = finished(process, 6)  # two episodes of v and one of w for each vehicle
     wait_until(lambda: database["Scenarios"].count_documents({"state": "Complete"}) == 6, PATIENCE)
     assert process.stop() == 0
     scenarios = {each["episode"]: each for each in database["Scenarios"].find()}

@@ -29,11 +29,11 @@ threading.Event().wait()
 """
 
 LOG_ALL = "info,zenoh::net::routing::interceptor::access_control=trace"
-"""As docs/security.md gives it."""
+"""As in docs/security.md."""
 
 
 class GuardedRouter:
-    """A router in a process of its own, where car1 may publish on its own keys and nobody may do anything else."""
+    """A router in a separate process that permits only car1 to publish on its own keys."""
 
     def __init__(self, folder: Path, log: str) -> None:
         self.authority = Authority(folder)
@@ -77,7 +77,7 @@ class GuardedRouter:
 
     @property
     def log(self) -> str:
-        return self._log.read_text(errors="replace")  # its end may be half a character
+        return self._log.read_text(errors="replace")  # it may end within a character
 
     def connect(self, certificate: tuple[Path, Path] | None) -> zenoh.Session:
         own = {} if certificate is None else {"certificate": str(certificate[0]), "key": str(certificate[1])}

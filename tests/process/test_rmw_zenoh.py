@@ -56,7 +56,7 @@ def attachment(number: int, gid: bytes, *, named: bool = False) -> zenoh.ZBytes:
 
 
 class Node:
-    """A publisher as rmw_zenoh makes one."""
+    """A publisher as rmw_zenoh creates it."""
 
     def __init__(self, session: zenoh.Session, topic: str, *, type_name: str = POSE_TYPE, domain: int = 0) -> None:
         package, _, name = type_name.split("/")
@@ -66,7 +66,7 @@ class Node:
         self._number = 0
 
     def publish(self, payload: bytes, *, skip: int = 0, named: bool = False) -> None:
-        """Publishes a message, after this number of lost ones."""
+        """Publishes a message after this number of lost ones."""
         self._number += 1 + skip
         self._session.put(
             self._key,

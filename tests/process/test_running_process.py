@@ -1,4 +1,4 @@
-"""A detector process over real Zenoh: its status and metrics are what was sent, and changes lose nothing."""
+"""A detector process over real Zenoh: its status and metrics match the sent samples, and changes lose nothing."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_status_and_metrics_match_the_samples_sent(process: Process) -> None:
     def dropped(status: Status) -> dict[tuple[str, str], int]:
         return {(drop.cause, drop.stream): drop.count for drop in status.drops if drop.count}
 
-    # What cannot be read is noticed when it is evaluated, and the last message names nobody, so is no sample.
+    # Unreadable samples are counted when they are evaluated; the last message names no client, so it is no sample.
     status = process.status_when(
         lambda s: s.streams[1].samples == 101 and bool(s.rules[0].open) and len(dropped(s)) == 2
     )
@@ -108,7 +108,7 @@ def test_rules_and_streams_change_without_losing_buffer_or_episodes(process: Pro
     slow = a_rule("slow", signals=[SPEED], when="v > 15", evaluation={"every": "100ms"})
     more = (a_stream("speed"), a_stream("pose"), a_stream("more"))
     process.change(FAST, slow, streams=more, clientTimeout="6m")
-    # The new rule's window reaches back to the sample that came before there was such a rule.
+    # The new rule's window includes the sample that arrived before the rule existed.
     after = process.status_when(lambda s: len(s.rules) == 2 and bool(s.rules[1].open))
     assert [stream.name for stream in after.streams] == ["speed", "pose", "more"]
     assert (after.rules[0].open, after.rules[0].started) == (1, 1)
@@ -161,7 +161,7 @@ def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) 
     process.start("--metrics-certificates", str(mounted))
 
     def shown(path: str, authority: Authority) -> str:
-        """The page for a client that trusts this authority; empty where that does not trust the detector."""
+        """The page for a client that trusts this authority; empty if it did not sign the certificate."""
         trusting = ssl.create_default_context(cafile=authority.ca)
         try:
             with urllib.request.urlopen(f"https://localhost:{process.port}{path}", context=trusting) as answer:
@@ -175,13 +175,13 @@ def test_metrics_and_health_by_tls_follow_a_renewed_certificate(tmp_path: Path) 
     assert not shown("/metrics", second)
     with pytest.raises(OSError, match=r"Remote end closed|reset"):
         process.page("/metrics")  # without TLS
-    with socket.create_connection(("127.0.0.1", process.port)):  # a client that never shakes hands stops nobody
+    with socket.create_connection(("127.0.0.1", process.port)):  # a client without a handshake blocks no other client
         assert shown("/healthz", first)
     broken = {"tls.crt": b"none", "tls.key": b"none"}
     first.change(mounted, broken)
     log = tmp_path / "log"
     wait_for(lambda: "--metrics-certificates: tls.crt and tls.key are not a certificate and a key" in log.read_text())
-    assert shown("/healthz", first), "the previous certificate stays"
+    assert shown("/healthz", first), "the previous certificate is kept"
     second.mount(mounted, "detector")
     wait_for(lambda: bool(shown("/healthz", second)))
     assert not shown("/healthz", first)

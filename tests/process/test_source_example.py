@@ -22,7 +22,7 @@ EXAMPLE = ROOT / "examples" / "source-plugin"
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
-    """In it the example package is installed."""
+    """An environment in which the example package is installed."""
     target = installed(EXAMPLE, tmp_path_factory.mktemp("installed"))
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), str(ROOT)])}
 
@@ -62,7 +62,7 @@ def test_the_detector_runs_the_source_plugin(environment: Mapping[str, str], tmp
                 try:
                     sender.send(b"no JSON")
                     sender.send(b'{"key": "sites/north/count", "value": {"vehicles": 12}}')
-                except ConnectionRefusedError:  # it does not listen yet
+                except ConnectionRefusedError:  # the source does not listen yet
                     time.sleep(0.05)
                 return events.exists() and "north" in events.read_text()
 

@@ -1,4 +1,4 @@
-"""Sources run supervised: started again when they fail, left behind when they hang, changed while running."""
+"""Sources are supervised: restarted when they fail, abandoned when they hang, changed while running."""
 
 import asyncio
 import itertools
@@ -36,7 +36,7 @@ class NoParameters(BaseModel):
 
 
 class Once(Source[NoParameters]):
-    """Delivers one message and has nothing more."""
+    """Delivers one message and returns."""
 
     Parameters: ClassVar[type[BaseModel]] = NoParameters
 
@@ -70,7 +70,7 @@ class Lasting(Once):
 
 
 class Hanging(Once):
-    """Does not look at the feed."""
+    """Ignores the feed."""
 
     began, ended = threading.Event(), threading.Event()
 
@@ -81,7 +81,7 @@ class Hanging(Once):
 
 
 class WithoutModel(Source[Any]):
-    """Has no model of its parameters."""
+    """Has no model for its parameters."""
 
     def run(self, feed: Feed) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Open episodes are kept in the state volume: they survive a kill, and a file that is broken harms nothing."""
+"""Open episodes are kept in the state volume: they survive a kill, and a broken file causes no failure."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_a_failing_disk_is_reported_once_and_the_newest_state_is_written_later(
     state = StateFile(tmp_path, "default", "h")
     draft = tmp_path / "default_h.new"
     draft.unlink()
-    draft.mkdir()  # no file can be written there now
+    draft.mkdir()  # no file can be written in it now
     for _ in range(3):
         failures = state.failures
         state.save(before[:1])
@@ -235,7 +235,7 @@ class Car:
         self.value = 20.0
 
     def wait_for(self, reached: Callable[[], bool], what: str) -> None:
-        """Keep publishing until it is so."""
+        """Keep publishing until `reached` returns true."""
 
         def look() -> bool:
             self._session.put("vehicles/car/speed", json.dumps({"v": self.value}).encode())

@@ -68,7 +68,7 @@ def test_events_are_published_with_their_encoding(listening: Network, endpoint: 
     with session(connect__endpoints=[endpoint]) as listener:
         subscriber = listener.declare_subscriber("wayside/events/**")
         deadline = time.monotonic() + PATIENCE
-        while (event := subscriber.try_recv()) is None:  # the first ones may go out before the subscription is known
+        while (event := subscriber.try_recv()) is None:  # the first ones may be sent before the subscription is known
             assert time.monotonic() < deadline
             listening.publish("wayside/events/det/rule/car1+car2", b"{}")
         assert str(event.key_expr) == "wayside/events/det/rule/car1+car2"

@@ -1,4 +1,4 @@
-"""`detector topics --live`: what comes over real Zenoh, and a Detector that takes it."""
+"""`detector topics --live`: the keys received over real Zenoh, and a Detector that subscribes to them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Traces: where a span stands follows from the episode, nobody waits for the exporter, and off costs nothing."""
+"""Traces: the episode determines a span's place, no thread waits for the exporter, and disabled tracing is free."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CONTEXTS = st.builds(TraceContext, st.integers(1, 2**128 - 1), st.integers(1, 2*
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No variable of the machine counts, spans are handed over soon, and the end waits until they are."""
+    """Ignores the machine's variables and exports spans soon; the end waits for the export."""
     monkeypatch.setattr("wayside.process.spans._PATIENCE", PATIENCE)
     for name in ("ENDPOINT", "TRACES_ENDPOINT", "PROTOCOL", "TRACES_PROTOCOL"):
         monkeypatch.delenv(f"OTEL_EXPORTER_OTLP_{name}", raising=False)

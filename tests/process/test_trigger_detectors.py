@@ -1,4 +1,4 @@
-"""One detector has another record: two `detector run` processes and a router, over real Zenoh."""
+"""One detector starts recordings of another: two `detector run` processes and a router, over real Zenoh."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SPEED = {"name": "v", "stream": "speed", "value": "msg.v"}
 
 
 class Peer(Process):
-    """A detector of that name which is a client of the router."""
+    """A detector of this name that is a client of the router."""
 
     def __init__(self, folder: Path, endpoint: str, name: str) -> None:
         folder.mkdir(exist_ok=True)
@@ -60,11 +60,11 @@ class Peer(Process):
         self.process.wait(PATIENCE)
 
     def folders(self) -> list[Path]:
-        """The recordings that stand under their final names."""
+        """The recordings with their final names."""
         return sorted(path.parent for path in (self.folder / "recordings").glob("*/*/metadata.yaml"))
 
     def under_way(self) -> int:
-        """Messages that the kernel has of recordings in progress."""
+        """The number of written messages of recordings in progress."""
         found = 0
         for path in (self.folder / "recordings").glob("*/.*/*.mcap"):
             with suppress(FileNotFoundError, McapError), path.open("rb") as file:
@@ -73,7 +73,7 @@ class Peer(Process):
         return found
 
     def recorded(self, folder: Path) -> list[tuple[str, Any]]:
-        """Topic and message of what is in a recording, in order."""
+        """The topics and messages of a recording, in order."""
         messages = []
         for path in sorted(folder.glob("*.mcap")):
             with path.open("rb") as file:
@@ -89,7 +89,7 @@ def endpoint() -> Iterator[str]:
 
 
 def a_recorder(folder: Path, endpoint: str) -> Peer:
-    """It records on request."""
+    """A detector that records on request."""
     peer = Peer(folder / "rsu", endpoint, "rsu")
     idle = a_rule("idle", signals=[SPEED], when="v > 1000")
     peer.write(idle, recordings={"path": str(folder / "rsu" / "recordings"), "onRequest": {}}, clientTimeout="60s")
@@ -107,7 +107,7 @@ def rsu(endpoint: str, tmp_path: Path) -> Iterator[Peer]:
 
 @pytest.fixture(scope="module")
 def unhurt(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
-    """A recorder that several tests ask, one after the other."""
+    """A recorder that several tests use, one after the other."""
     where = free_endpoint()
     with router_process(where):
         peer = a_recorder(tmp_path_factory.mktemp("unhurt"), where)
@@ -238,7 +238,7 @@ def test_a_killed_requester_comes_back_and_stops_what_it_started(rsu: Peer, town
 
 
 def test_a_restarted_requester_without_its_episode_stops_the_recording(rsu: Peer, town: Peer) -> None:
-    """Its rule is another when it comes back: the journal has the recordings to stop."""
+    """Its rule differs after the restart: the journal has the recordings to stop."""
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
     town.kill()
@@ -254,7 +254,7 @@ def test_a_recorder_that_is_killed_continues_when_it_is_back(rsu: Peer, town: Pe
     town.send("car1", {"v": 20})
     wait_for(lambda: recording(town.endpoint), PATIENCE)
     town.send("car1", {"n": 1}, "pose")
-    wait_for(lambda: rsu.under_way() == 1, PATIENCE)  # what the kernel does not have yet, a kill costs
+    wait_for(lambda: rsu.under_way() == 1, PATIENCE)  # a kill loses unwritten data
     rsu.kill()
     rsu.start()
     wait_for(lambda: recording(rsu.endpoint), PATIENCE)
@@ -306,7 +306,7 @@ def test_people_request_recordings_by_commands(unhurt: Peer) -> None:
 
 
 def test_path_characters_of_a_request_do_not_reach_file_names(unhurt: Peer) -> None:
-    """Its subject stands in names of files."""
+    """Its subject is a part of file names."""
     request = RecordingRequest(
         do="start", id="stranger", event={"subject": "../../../x", "data": {"classification": 3}}
     )

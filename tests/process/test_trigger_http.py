@@ -1,4 +1,4 @@
-"""A rule has an HTTP endpoint record: real requests to real servers, also to such as misbehave."""
+"""A rule starts recordings through an HTTP endpoint: real requests to real servers, also misbehaving ones."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class NoMessenger:
 
 
 class DrivenAction:
-    """The action as its host drives it, on this thread."""
+    """The action as its host calls it, on this thread."""
 
     def __init__(self, trigger: dict[str, Any], state: Path | None = None) -> None:
         spec = {} if state is None else {"state": {"path": str(state)}}
@@ -152,7 +152,7 @@ def test_a_failed_request_is_retried_with_the_same_idempotency_key(fault: Any) -
         there.behaviour = fault
         driven.action.ended(end(episode))
         driven.until(lambda: any("stop is not confirmed yet" in outcome.message for outcome in driven.outcomes))
-        there.behaviour = answers(404)  # it had arrived: nothing is there any more
+        there.behaviour = answers(404)  # the first stop had arrived: no recording is left
         assert driven.finished().state is OutcomeState.DONE
     assert driven.lost == []
 
@@ -209,7 +209,7 @@ def test_at_shutdown_a_recording_that_cannot_be_restored_is_stopped() -> None:
 
 
 def test_a_restored_recording_continues_and_is_stopped_by_the_next_run(tmp_path: Path) -> None:
-    """The journal keeps what was rendered, of which the next run knows nothing else."""
+    """The journal keeps the rendered requests, the only data that the next run has."""
     with endpoint() as there:
         trigger = http(there.url)
         trigger["http"]["stop"] = {"url": f"{there.url}/stop", "body": {"who": "${client}"}}
@@ -241,7 +241,7 @@ def test_a_restored_recording_continues_and_is_stopped_by_the_next_run(tmp_path:
 def test_a_changed_rule_leaves_the_recordings_of_its_running_episodes_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The action with its old rule ends them, though the one with the new rule has the same parameters."""
+    """The action with its old rule ends them, although the one with the new rule has the same parameters."""
     monkeypatch.setattr("detector.actions.trigger.action._CLAIM", 0.0)
     with endpoint() as there:
         before = DrivenAction(http(there.url), tmp_path)
@@ -269,7 +269,7 @@ def test_an_unwritable_state_folder_is_counted_and_affects_nothing_else(tmp_path
 
 
 def test_a_dead_endpoint_gets_one_attempt_at_a_time() -> None:
-    """Fifty episodes wait for it together, and not each for its own timeout."""
+    """Fifty episodes share one timeout instead of waiting for one each."""
     with endpoint(hangs()) as there:
         driven = DrivenAction(http(there.url, "1s"))
         for number in range(50):

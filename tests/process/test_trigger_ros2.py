@@ -1,4 +1,4 @@
-"""A rule has a ROS 2 recorder started and stopped: a `detector run` process and a made-up node, over real Zenoh."""
+"""A rule starts and stops a ROS 2 recorder: a `detector run` process and a simulated node, over real Zenoh."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOTHING: dict[str, Any] = {}
 
 @pytest.fixture
 def process(tmp_path: Path) -> Iterator[Process]:
-    """A test starts it, with its rule."""
+    """A detector that the test starts with its own rule."""
     process = Process(tmp_path)
     yield process
     assert process.stop() == 0
@@ -50,7 +50,7 @@ def call(service: str, name: str, **fields: Any) -> dict[str, Any]:
 
 
 def test_a_service_of_rmw_zenoh_is_called_once_for_each_episode(process: Process) -> None:
-    """With the very key that a node of std_srvs has, and the attachment that its server requires."""
+    """With exactly the key of a std_srvs node, and the attachment that its server requires."""
     start_with(process, fast(domain=7, stop={"service": "/recorder/snap", "type": "std_srvs/srv/Trigger"}))
     node = Node(process.vehicle, domain=7)
     served = {"success": True, "message": "snapped"}

@@ -1,4 +1,4 @@
-"""Users' expressions run in worker processes: what takes too long is ended there, and harms nobody else."""
+"""Users' expressions run in worker processes: a slow one is ended there and affects no other."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from application_manager.workers.pool import ExceededError, JobError, Pool
 from tests.worker_jobs import Defective, Evaluation, Greedy, KilledOnce, Scheduled, Where
 
 LIMIT = 0.5
-"""Seconds of CPU time; what is not to exceed it takes a fiftieth of that."""
+"""The limit in seconds of CPU time; jobs that must not exceed it take a fiftieth of it."""
 
 BOMB = Evaluation(100_000)
 
@@ -32,7 +32,7 @@ def with_pool(work: Callable[[Pool], Awaitable[None]], cpu_time: float = LIMIT) 
 
 
 def alive(pid: int) -> bool:
-    """Whether the process is there."""
+    """Whether the process exists."""
     return Path(f"/proc/{pid}").exists()
 
 
@@ -56,7 +56,7 @@ def test_the_event_loop_continues_while_an_expression_holds_the_gil() -> None:
         while not bomb.done():
             turns += 1
             await asyncio.sleep(0.01)
-        assert turns > 3  # with the lock held there would be one
+        assert turns > 3  # with the GIL held there would be one
         with pytest.raises(ExceededError):
             await bomb
 
@@ -143,7 +143,7 @@ def test_answers_are_cached_and_a_timeout_is_not_computed_again() -> None:
             return found
 
         first = await answer(1, Where())
-        assert await answer(1, Defective()) == first  # type: ignore[arg-type]  it is not even looked at
+        assert await answer(1, Defective()) == first  # type: ignore[arg-type]  it is not read
         exceeded = await answer(2, BOMB)
         assert isinstance(exceeded, Exceeded)
         assert await answer(2, Where()) == exceeded
