@@ -43,7 +43,7 @@ BUILDS: tuple[Callable[[], int], ...] = (
     mongodb.main,
     s3.main,
 )
-"""Each prints what it provides, or why it cannot, and returns an exit code."""
+"""Each prints the path of its build or the reason for a failure, and returns an exit code."""
 
 
 def main() -> int:

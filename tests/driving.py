@@ -1,6 +1,6 @@
-"""Drives an engine from a test: detectors and rules in a few words, samples at seconds after a start.
+"""Drives an engine from a test: short definitions of detectors and rules, samples at seconds after a start.
 
-Everything is real but the data: keys, decoders and rules come in as `detector run` brings them in.
+Only the data is simulated: keys, decoders and rules are those of `detector run`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ SPEED = {"name": "speed", "stream": "speed", "value": "msg.v"}
 """A signal."""
 
 POSITION = {"stream": "pose", "x": "msg.x", "y": "msg.y", "maxAge": "30s"}
-"""Places hold for long: tests that are not about their age send few."""
+"""Positions stay valid for long: tests that are not about their age send few."""
 
 
 def at(seconds: float) -> int:
-    """That many seconds after the start, to the microsecond, in nanoseconds since the epoch."""
+    """The time this number of seconds after the start, to the microsecond, in nanoseconds since the epoch."""
     return START + round(seconds * 1e6) * 1000
 
 
@@ -86,7 +86,7 @@ def an_engine(detector: Detector, *rules: EventRule, start: float = 0.0) -> Engi
 
 
 class Drive:
-    """An engine and the time that has come."""
+    """An engine and the current time."""
 
     def __init__(self, detector: Detector, *rules: EventRule, start: float = 0.0) -> None:
         self.detector = detector
@@ -94,11 +94,11 @@ class Drive:
         self.events: list[Event] = []
 
     def take(self, *arrivals: Arrival, until: float) -> list[str]:
-        """Advance; returns what happened in a few words (see `reported`)."""
+        """Advance the time; return the events in short form (see `reported`)."""
         return self.note(self.engine.advance(arrivals, at(until)))
 
     def finish(self) -> list[str]:
-        """Nothing more comes; returns what happened."""
+        """End the input; return the remaining events."""
         return self.note([event for events in self.engine.finish() for event in events])
 
     def note(self, events: Sequence[Event]) -> list[str]:
@@ -107,7 +107,7 @@ class Drive:
 
 
 def reported(events: Sequence[Event]) -> list[str]:
-    """Events in a few words: `r car1 started 3`, `r car1 Until 5`; times in seconds after the start."""
+    """Events in short form: `r car1 started 3`, `r car1 Until 5`; times in seconds after the start."""
     return [
         f"{event.episode.rule} {event.episode.subject} {event.reason or 'started'} {(event.time - START) / 1e9:g}"
         for event in events

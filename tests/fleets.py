@@ -72,7 +72,7 @@ RULES = "---".join((TOO_FAST, HARSH, CLOSE))
 
 
 def drive(seed: int, seconds: float, cars: int = 3) -> Iterator[tuple[int, str, dict[str, object]]]:
-    """Time, key and value of each message of one recording; one car falls silent for a while."""
+    """Time, key and value of each message of one recording; one car sends nothing for a while."""
     chance = random.Random(seed)
     phases = [(chance.uniform(0, 6), chance.uniform(0.2, 0.5), chance.uniform(5, 8)) for _ in range(cars)]
     silent = chance.uniform(0, seconds * 0.7)
@@ -104,7 +104,7 @@ def write_mcap(path: Path, seed: int, seconds: float, cars: int = 3) -> Path:
 def write_fleet(folder: Path, recordings: int, seconds: float, broken: int = 3) -> Path:
     """The folder with Detector, rules, and a folder `drives` with the recordings; every other one is MCAP.
 
-    The first of the broken ones is no recording, the second has a bad line, the third is cut.
+    The first broken file is no recording, the second has a bad line, the third is truncated.
     """
     (folder / "detector.yaml").write_text(DETECTOR)
     (folder / "rules.yaml").write_text(RULES)

@@ -1,7 +1,7 @@
 """Programs built from a pinned Go module into a cache outside the tree.
 
-A program appears in the cache by an atomic rename: an interrupted build leaves nothing that looks finished. A folder
-has a hash of all that decides what comes out as its name, so another pin is another folder; a lock keeps builds apart.
+A program appears in the cache by an atomic rename: an interrupted build leaves no file that looks finished. The name
+of a folder is a hash of all inputs of the build, so each pin has its own folder; a lock separates concurrent builds.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ STRIPPED = "-s -w"
 
 
 def kubernetes(version: str) -> str:
-    """What the linker gets for this version, e.g. 1.36.3.
+    """The linker's flags for this version, e.g. 1.36.3.
 
-    A plain `go build` calls itself v0.0.0, which clients and CRD conversion then believe.
+    A plain `go build` reports v0.0.0, on which clients and CRD conversion then rely.
     """
     major, minor, _ = version.split(".")
     package = "k8s.io/component-base/version"
@@ -46,7 +46,7 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class GoModule:
-    """A folder with go.mod and go.sum, and what is built from it.
+    """A folder with go.mod and go.sum, and the programs built from it.
 
     Attributes:
         name: of its part of the cache.
@@ -85,7 +85,7 @@ class GoModule:
         return folder
 
     def _build(self, names: Sequence[str], folder: Path, console: Console) -> None:
-        """Build all at once: Go compiles what they share only once, and links one while it compiles the next."""
+        """Build all at once: Go compiles shared packages only once, and links one while it compiles the next."""
         what = ", ".join(names)
         try:
             go = find_go(cache() / "controlplane" / "go", console)
@@ -127,7 +127,7 @@ def cache(environment: Mapping[str, str] = os.environ) -> Path:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep others out of a folder."""
+    """Lock a folder against other builds."""
     with path.open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield

@@ -24,7 +24,7 @@ class Received:
     """By lower-case name."""
     body: bytes
     at: float
-    """When it was there, by the monotonic clock."""
+    """The time of its arrival, by the monotonic clock."""
 
 
 Behaviour = Callable[["Endpoint", socket.socket, Received], None]
@@ -68,7 +68,7 @@ def first_then(first: Behaviour, then: Behaviour) -> Behaviour:
 
 
 def holds(until: threading.Event, then: Behaviour) -> Behaviour:
-    """Nothing until the event is set, then that."""
+    """Send nothing until the event is set, then behave like the given behaviour."""
 
     def hold(endpoint: Endpoint, connection: socket.socket, request: Received) -> None:
         assert until.wait(PATIENCE)
@@ -116,14 +116,14 @@ class Endpoint:
         return f"{'https' if self._context else 'http'}://localhost:{self.port}"
 
     def received(self, count: int) -> list[Received]:
-        """The requests, once there is this number of them."""
+        """The requests, once this number of them have arrived."""
         with self._arrived:
             assert self._arrived.wait_for(lambda: len(self.requests) >= count, PATIENCE), self.requests
             return list(self.requests)
 
     def close(self) -> None:
         self.ended.set()
-        self._listener.shutdown(socket.SHUT_RDWR)  # a thread that waits in accept() keeps it open otherwise
+        self._listener.shutdown(socket.SHUT_RDWR)  # otherwise a thread that waits in accept() keeps it open
         self._listener.close()
 
     def _run(self) -> None:
@@ -145,7 +145,7 @@ class Endpoint:
                     self.requests.append(request)
                     self._arrived.notify_all()
                 behaviour(self, connection, request)
-        except OSError:  # the other side has had enough, or does not like the certificate
+        except OSError:  # the client has disconnected or rejects the certificate
             connection.close()
 
 
@@ -171,7 +171,7 @@ def _some(connection: socket.socket) -> bytes:
 
 @contextmanager
 def endpoint(behaviour: Behaviour | None = None, certificate: tuple[Path, Path] | None = None) -> Iterator[Endpoint]:
-    """An endpoint for the length of a test; with a certificate and its key it speaks TLS."""
+    """An endpoint for the duration of a test; with a certificate and its key it uses TLS."""
     context = None
     if certificate is not None:
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
@@ -193,7 +193,7 @@ def nobody() -> Iterator[str]:
 
 @contextmanager
 def endpoint_for(authority: Path, certificate: tuple[Path, Path]) -> Iterator[Endpoint]:
-    """One that requires a certificate of the authority."""
+    """A TLS context that requires a client certificate of the authority."""
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(authority))
     context.load_cert_chain(*certificate)
     context.verify_mode = ssl.CERT_REQUIRED

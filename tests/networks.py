@@ -47,7 +47,7 @@ def stream(name: str = "pose", key: str = "vehicles/${client:*}/pose", **fields:
 
 
 def session(mode: str = "client", **settings: Any) -> zenoh.Session:
-    """A Zenoh session that finds others by its endpoints alone; paths of settings with __ for /."""
+    """A Zenoh session without scouting; the paths of settings have __ for /."""
     config = zenoh.Config()
     for path, value in {"mode": mode, "scouting__multicast__enabled": False, **settings}.items():
         config.insert_json5(path.replace("__", "/"), json.dumps(value))
@@ -61,7 +61,7 @@ def router(**settings: Any) -> zenoh.Session:
 
 @contextmanager
 def guarded_router(at: str, authority: Authority, **more: Any) -> Iterator[zenoh.Session]:
-    """A router that knows this authority, lets in only what it signed, and nothing whose certificate has expired."""
+    """A router that accepts only clients with an unexpired certificate of this authority."""
     certificate, key = authority.sign("router")
     tls = {
         "listen_certificate": str(certificate),
@@ -88,7 +88,7 @@ threading.Event().wait()
 
 @contextmanager
 def router_process(endpoint: str) -> Iterator[None]:
-    """A Zenoh router in a process of its own, which is killed at the end."""
+    """A Zenoh router in a separate process, which is killed at the end."""
     process = subprocess.Popen([sys.executable, "-c", _ROUTER, endpoint], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

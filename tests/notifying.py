@@ -42,7 +42,7 @@ class Harness:
     changed: threading.Condition = field(default_factory=threading.Condition)
 
     def outcome(self, episode: str, state: OutcomeState = OutcomeState.DONE) -> Outcome:
-        """The episode's outcome of that state, once it is reported."""
+        """The episode's outcome with this state, once it is reported."""
         return self.until(lambda: next((o for e, o in self.outcomes if e == episode and o.state is state), None))
 
     def until(self, get: Callable[[], Any]) -> Any:

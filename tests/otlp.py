@@ -20,7 +20,7 @@ ERROR = 2
 
 @dataclass(frozen=True)
 class Received:
-    """A span as it came: ids in hexadecimal, '' for no parent; times in nanoseconds since the epoch."""
+    """A span as received: ids in hexadecimal, '' for no parent; times in nanoseconds since the epoch."""
 
     service: str
     name: str
@@ -35,7 +35,7 @@ class Received:
 
     @property
     def traceparent(self) -> str:
-        """In the form of W3C's header."""
+        """In the form of the W3C traceparent header."""
         return f"00-{self.trace}-{self.id}-01"
 
 

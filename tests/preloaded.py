@@ -12,4 +12,4 @@ for package in ("wayside", "detector", "application_manager"):
         if not module.name.endswith(".__main__"):
             import_module(module.name)
 
-assert tests.programs  # what is forked finds it imported
+assert tests.programs  # forked processes inherit the imports

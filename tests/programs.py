@@ -1,4 +1,4 @@
-"""Our programs as processes that start fast: forked from one that has imported them already.
+"""Wayside's programs as processes that start fast: forked from a process that has already imported them.
 
 Importing what a program needs takes one to two seconds of CPU, and hundreds of tests start one. So each worker of a
 test run has a fork server (Python's own, of `multiprocessing`) that imports both programs once. What it forks is a
@@ -62,7 +62,7 @@ class Program:
         self.arguments = [str(each) for each in arguments]
         files = (output.absolute(), (errors or output).absolute())
         for file in files:
-            file.touch()  # who reads it at once finds it
+            file.touch()  # the file exists for an immediate reader
         everything = dict(os.environ if environment is None else environment)
         where = str(folder or Path.cwd())
         # A daemon of `multiprocessing` is one that is terminated at the end of the test run, not waited for.
@@ -96,7 +96,7 @@ class Program:
     def send_signal(self, number: int) -> None:
         """Send a signal; nothing happens if it has ended."""
         if self.returncode is None:
-            with suppress(ProcessLookupError):  # it has ended, and its exit code is not known yet
+            with suppress(ProcessLookupError):  # it has ended, but its exit code is not known yet
                 os.kill(self.pid, number)
 
     def terminate(self) -> None:
@@ -119,7 +119,7 @@ def run(
 
     Args:
         arguments: the program's name and its arguments.
-        environment: what it gets beside that of the test run.
+        environment: variables in addition to those of the test run.
         folder: its working directory.
         check: raise subprocess.CalledProcessError where the exit code is not 0.
         timeout: seconds, after which it is killed and subprocess.TimeoutExpired raised.
@@ -140,7 +140,7 @@ def run(
 
 
 def _become(arguments: list[str], files: tuple[Path, Path], environment: dict[str, str], folder: str) -> None:
-    """Be the program, in a process that was just forked."""
+    """Run as the program, in a process that was just forked."""
     from importlib import import_module
 
     os.setsid()

@@ -14,11 +14,11 @@ _PACKAGE = "prometheus"
 
 
 class PromtoolUnavailableError(Exception):
-    """There is no promtool, and it is unavailable; the message gives the remedy."""
+    """promtool is not installed and cannot be fetched; the message gives the remedy."""
 
 
 def find_promtool() -> Path:
-    """Where it is; fetched into the cache where it is missing. Raises PromtoolUnavailableError."""
+    """The path of promtool; fetches it into the cache if it is missing. Raises PromtoolUnavailableError."""
     if (there := shutil.which("promtool")) is not None:
         return Path(there)
     cached = cache() / "promtool" / "promtool"

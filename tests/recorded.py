@@ -1,4 +1,4 @@
-"""Recordings, message by message: what they hold, and JSON lines as users write them."""
+"""The messages of recordings, and JSON lines as users write them."""
 
 from __future__ import annotations
 

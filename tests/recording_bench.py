@@ -1,4 +1,4 @@
-"""A record action without a detector around it: the test passes it episodes, and reads its files."""
+"""A record action without a detector: the test passes it episodes and reads its files."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class Bench:
         return self._known
 
     def limit(self, **recordings: Any) -> None:
-        """The Detector's limits change."""
+        """Change the Detector's limits."""
         self.detector = recording_detector(self.path, *self._streams, **recordings)
 
     def record(self, episode: Episode, samples: Sequence[EpisodeSample], completion: Completion | None = None) -> Path:
-        """A whole episode; gives the folder."""
+        """Record a whole episode; return the folder."""
         self.action.started(episode)
         self.action.samples(episode, samples)
         self.action.ended(episode)
@@ -73,7 +73,7 @@ class Bench:
         return [outcome for name, outcome in self.reports if name == episode.id][-1]
 
     def folder(self, episode: Episode) -> Path:
-        """Where its recording is; there must be one."""
+        """The folder of its only recording."""
         outcome = self.outcome(episode)
         assert outcome.state is not OutcomeState.RUNNING
         return Path(str(outcome.details["folder"]))
@@ -171,7 +171,7 @@ def read_with_mcap(file: Path) -> list[Recorded]:
 
 
 def read_with_rosbags(path: Path) -> list[Recorded]:
-    """A bag or one of its files. What is no ROS topic, bags do not have."""
+    """A bag or one of its files. Bags contain only ROS topics."""
     with Reader(path) as reader:
         return [Recorded(c.topic, seconds(time), bytes(payload)) for c, time, payload in reader.messages()]
 

@@ -1,7 +1,7 @@
 """Servers that all workers of a test run share: the first that needs one starts it, and stops it after the last.
 
-The workers of pytest-xdist are processes that know nothing of each other, so they meet at files in the folder of the
-run. Locks on files go with the process that holds them, so a worker that is killed holds up no other.
+The workers of pytest-xdist are processes that know nothing of each other, so they coordinate through files in the
+folder of the run. The kernel releases the file locks of a killed worker, so it blocks no other.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Server = TypeVar("Server")
 
 
 def run_folder(factory: pytest.TempPathFactory) -> Path:
-    """The folder that all workers of the run have in common; pytest keeps those of the last three runs."""
+    """The folder that all workers of the run share; pytest keeps those of the last three runs."""
     own = factory.getbasetemp()
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from wayside.expressions import CelType, Environment
 
 BOMB = 'l.filter(x, s.matches("([ab]*a[ab]{50}){3}z")).size()'
-"""Takes some 15 ms for each item of `l`, where `s` has 4 KiB, in C++ and with the interpreter's lock held."""
+"""Takes about 15 ms for each item of `l` if `s` has 4 KiB, in C++, while it holds the GIL."""
 
 TEXT = "".join(random.Random(1).choices("ab", k=4000))  # without a pattern, so that RE2 remembers nothing
 
@@ -53,7 +53,7 @@ class KilledOnce:
     marker: Path
 
     def __call__(self) -> str:
-        """Where it was not killed."""
+        """The result of the attempt that was not killed."""
         if not self.marker.exists():
             self.marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
@@ -65,13 +65,13 @@ class Greedy:
     """Takes more memory than a process may have."""
 
     def __call__(self) -> int:
-        """A number that never comes."""
+        """Never returns."""
         return len(b" " * (2 * 1024**3))
 
 
 @dataclass(frozen=True)
 class Defective:
-    """Raises what no job should."""
+    """Raises an exception that no job should raise."""
 
     def __call__(self) -> object:
         """Nothing."""

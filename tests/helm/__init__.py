@@ -1,7 +1,7 @@
 """Helm and an OCI registry, built from pinned source into a cache outside the tree.
 
 `python -m tests.helm` builds what is missing, in `${XDG_CACHE_HOME:-~/.cache}/wayside/helm/<hash>/`: about four minutes
-of one core, once. The hash covers all that decides what comes out, as for the control plane.
+of one core, once. The hash covers all inputs of the build, as for the control plane.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ToolsUnavailableError(Exception):
 
 @dataclass(frozen=True)
 class Tools:
-    """Where each program is."""
+    """The path of each program."""
 
     helm: Path
     registry: Path

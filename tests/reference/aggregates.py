@@ -12,7 +12,7 @@ NOTHING = object()
 
 
 def aggregated(name: str, window: list[tuple[int, Any]], quantile: float | None = None) -> Any:
-    """Of (time, value) from the oldest on; a value that is unknown is NOTHING."""
+    """The aggregate of (time, value) pairs, the oldest first; an unknown value is NOTHING."""
     values = [value for _, value in window]
     if name == "Count":
         return float(len(values))

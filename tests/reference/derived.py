@@ -11,7 +11,7 @@ from tests.reference.scopes import SubjectView
 from tests.reference.signals import evaluated, nanoseconds
 
 Values = dict[str, Any]
-"""Of expressions, by signal; NOTHING where they are unknown."""
+"""The values of expressions by signal; NOTHING for unknown ones."""
 
 
 @dataclass

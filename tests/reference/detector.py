@@ -15,7 +15,7 @@ from tests.reference.signals import Sources, Start, nanoseconds, of_rule, truth
 
 @dataclass(frozen=True)
 class Reported:
-    """An event. Times are nanoseconds; `reason` is empty where it is a start."""
+    """An event. Times are nanoseconds; `reason` is empty for a start."""
 
     rule: str
     subject: str
@@ -27,7 +27,7 @@ class Reported:
 
 @dataclass
 class Rule:
-    """A rule as written, and all observations of its subjects."""
+    """A rule as written, with all observations of its subjects."""
 
     name: str
     spec: dict[str, Any]
@@ -133,7 +133,7 @@ class Reference:
         self._heard(sample.time)
 
     def nothing(self, time: int) -> None:
-        """A message without any item comes."""
+        """Add a message without items."""
         if self.lateness is None:
             self.advance(time - 1)
         elif self._begins(time):
@@ -146,7 +146,7 @@ class Reference:
             self.advance(self.newest - max(self.lateness, 1))
 
     def finish(self) -> None:
-        """Nothing more comes: with clock Data, what has waited for `lateness` is evaluated."""
+        """End the input: with clock Data, evaluate the samples that have waited for `lateness`."""
         if self.lateness is not None:
             self.advance(self.newest)
 
@@ -165,7 +165,7 @@ class Reference:
                 self.received.take(each)
 
     def advance(self, until: int) -> None:
-        """Run the ticks up to here."""
+        """Run the ticks up to this time."""
         while (tick := min(self._next_ticks())) <= until:
             self.now, self.ticked = tick, True
             triggers = self._triggers()
@@ -176,14 +176,14 @@ class Reference:
             self.now = max(self.now, until)
 
     def _next_ticks(self) -> set[int]:
-        """When it may be the turn of a rule."""
+        """The times at which a rule may be due."""
         regular = {self.now - self.now % period + period for period in self._periods()}
         samples = {each.time for each in self.waiting if each.stream in self._triggers()}
         wakes = {time for rule in self.rules if rule.on_sample for time in rule.wakes(self.received.timeout)}
         return {time for time in regular | samples | wakes if time > self.now}
 
     def gap(self, time: int) -> None:
-        """Time continues here without the ticks between."""
+        """Continue at this time without the ticks before it."""
         self._enter(time)
         self.now = time
         self.received.gap(time)

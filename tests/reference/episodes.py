@@ -1,4 +1,4 @@
-"""The episodes of one subject, from all that was ever seen of it."""
+"""The episodes of one subject, from its whole history."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def located(spec: dict[str, Any], positions: dict[str, dict[str, str]]) -> dict[
 
 
 def _place(name: str, variables: dict[str, Any], where: PlaceContext) -> dict[str, float]:
-    """The position that an expression names, without what is not known."""
+    """The position that an expression names, without unknown values."""
     if name in ("position", "positionBefore"):
         message = variables.get("msg" if name == "position" else "before") or {}
         given = {axis: message.get(field.removeprefix("msg.")) for axis, field in where.position.items()}
@@ -103,7 +103,7 @@ def _at(position: dict[str, float], place: dict[str, Any], name: str) -> Any:
 
 
 def _seen(a: dict[str, Any], b: dict[str, Any], name: str) -> float | None:
-    """`b` turned into the frame of `a`; None where it takes what is not known."""
+    """`b` turned into the frame of `a`; None if a required value is unknown."""
     motion = [each.get(axis) for each in (a, b) for axis in ("yaw", "speed")]
     places = [each.get("position", {}).get(axis) for each in (a, b) for axis in ("x", "y")]
     needed = {"ahead": [*places, motion[0]], "left": [*places, motion[0]], "heading": [motion[0], motion[2]]}

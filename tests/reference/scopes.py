@@ -139,7 +139,7 @@ def _distance(one: tuple[float, ...] | None, other: tuple[float, ...] | None) ->
 
 
 def _closing_speed(position: dict[str, str], a: str, b: str, received: Received, now: int) -> float | None:
-    """By how much the distance shrank in the last second for which both have sent their places."""
+    """The decrease of the distance in the latest second for which both have sent their positions."""
     end = now
     if _limits(position, received) != []:
         end = min(received.kept(client, position["stream"], now)[-1].time for client in (a, b))

@@ -13,7 +13,7 @@ from tests.reference.samples import SECOND, Received
 from wayside.expressions import UNKNOWN, CelType, Environment, Expression
 
 VARIABLES = ("msg", "item", "before", "key", "sample")
-"""Of expressions over one sample."""
+"""The variables of expressions over one sample."""
 
 
 @cache
@@ -47,14 +47,14 @@ def evaluated(source: str, variables: dict[str, Any], names: tuple[str, ...]) ->
 
 @dataclass(frozen=True)
 class Start:
-    """An episode of a rule started. `clients` is None for everybody."""
+    """The start of a rule's episode. `clients` is None for all clients."""
 
     rule: str
     time: int
     clients: tuple[str, ...] | None
     message: dict[str, Any]
     ends: bool = False
-    """Whether it is an end instead."""
+    """Whether it is the end of the episode instead."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,14 @@ class Item:
 
     time: int
     message: Any
-    """None where it cannot be read."""
+    """None if the sample cannot be decoded."""
     sample: dict[str, float]
     item: Any = None
     before: Any = None
 
 
 def of_rule(signal: dict[str, Any]) -> tuple[str, bool]:
-    """Whose starts or ends a signal is over."""
+    """The rule whose episodes are the input of a signal, and whether their ends are, not their starts."""
     return signal["ruleName"], signal.get("samples") == "Ends"
 
 
