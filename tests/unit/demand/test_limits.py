@@ -96,7 +96,9 @@ def test_a_higher_priority_preempts_and_both_tasks_name_the_other() -> None:
     assert after.verdicts["low"].reason == "Preempted"
     assert f"was preempted by instance {instance_name('app', 'high')} (task high" in after.verdicts["low"].message
     assert f"preempts instance {instance_name('app', 'low')} (task low" in after.verdicts["high"].message
-    assert running(of(served(low), instances=[runs("high", release_at=NOW + 9)])) == set()  # until what lingers is gone
+    assert (
+        running(of(served(low), instances=[runs("high", release_at=NOW + 9)])) == set()
+    )  # until the lingering instances are deleted
     assert running(of(served(low))) == {"low"}
 
 
@@ -255,7 +257,7 @@ class SimulatedNamespace:
                 if not linger or not any(each.status for each in self.instances.values()):
                     return
                 self.now += 5
-        raise AssertionError("it never comes to rest")
+        raise AssertionError("it never becomes stable")
 
     def check_limits(self) -> None:
         counts = Counter(each.spec.template_name for each in self.instances.values())

@@ -275,7 +275,7 @@ def applications(decisions: Any) -> dict[str, tuple[Any, ...]]:
 
 
 def made(outcome: NamespaceOutcome, existing: list[ApplicationInstance]) -> list[ApplicationInstance]:
-    """The instances after the manager has done what was decided; none is released."""
+    """The instances after the manager has applied the decisions; none is released."""
     known = {each.name: each for each in existing}
 
     def one(decision: Decision) -> ApplicationInstance:

@@ -104,7 +104,7 @@ def _occurs(quote: str, strings: set[str]) -> bool:
 
 
 def _strings() -> Iterator[str]:
-    """All strings of the programs, with … for what an f-string inserts, and the members of all enums."""
+    """All strings of the programs, with … for each value that an f-string inserts, and the members of all enums."""
     for file in (
         file for each in ("detector", "application_manager", "wayside") for file in (ROOT / each).rglob("*.py")
     ):

@@ -26,7 +26,7 @@ def config(name: str, **data: str) -> Object:
 
 
 def there(name: str, owner: Any = None, uid: str = "") -> Object:
-    """A ConfigMap in the cluster, controlled by an instance or by nobody."""
+    """A ConfigMap in the cluster, with or without an instance as its controller."""
     made = config(name)
     made["metadata"] |= {"namespace": "site", **({"uid": uid} if uid else {})}
     return made if owner is None else owned(made, owner)
@@ -39,7 +39,7 @@ def key(name: str) -> tuple[str, str, str]:
 def applied(
     server: MemoryServer, *names: str, known: LastApplied | None = None, meanwhile: Object | None = None
 ) -> ApplyResult:
-    """Apply ConfigMaps of these names; `meanwhile`: what is put into the cluster between the look and the apply."""
+    """Apply ConfigMaps of these names; `meanwhile`: objects created between the read and the apply."""
 
     async def run() -> ApplyResult:
         rendering = Renderer(template(manifests=[config(name, new="yes") for name in names]), Policy()).render(APP)

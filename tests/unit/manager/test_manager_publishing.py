@@ -65,7 +65,7 @@ def _copy(one: socket.socket, other: socket.socket) -> None:
 
 @contextmanager
 def running(publisher: Publisher) -> Iterator[Callable[[Callable[[], None]], None]]:
-    """The publisher at work in an event loop of its own; the function yielded runs a call in that loop."""
+    """The running publisher in a separate event loop; the yielded function runs a call in that loop."""
     calls: list[Any] = []  # the loop, and the task in it
     started, ended = threading.Event(), threading.Event()
 
@@ -146,7 +146,7 @@ def test_without_a_network_nothing_is_kept_and_the_end_is_prompt() -> None:
     with running(silent) as call:
         call(lambda: silent.publish(NAME, {"a": "1"}))
     with running(Publisher(settings([free_endpoint()]))):
-        pass  # nobody listens there: it tries until it is cancelled
+        pass  # without a listener, it retries until it is cancelled
 
 
 def test_the_key_names_namespace_and_instance() -> None:

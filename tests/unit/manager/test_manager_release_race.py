@@ -17,7 +17,7 @@ KEYED = {"key": "${parameters.place}", "parameters": {"place": {"type": "string"
 
 
 class GoingServer:
-    """An API server on which the instance goes just while the tasks are listed; everything written is noted."""
+    """An API server that deletes the instance while the tasks are listed; it records all writes."""
 
     def __init__(self, cache: ClusterCache) -> None:
         self.cache = cache
