@@ -219,7 +219,7 @@ class Running:
 
     def _putter(self, stream: str) -> Put:
         """The inputs for the messages of a stream; changes of tokens wait for room before they are dropped."""
-        return self._intake.patient_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
+        return self._intake.blocking_putter(stream) if stream == LIVELINESS else self._intake.putter(stream)
 
     def _good(self, wanted: Detector) -> Detector:
         """The changed Detector, or the last good one if it cannot run."""

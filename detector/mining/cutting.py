@@ -1,4 +1,4 @@
-"""Which recordings are cut into pieces, where, and for which rules this is exact.
+"""Decides how a recording is cut into pieces, and for which rules the cut is exact.
 
 A piece computes the observations of its ticks from its own samples and those shortly before: windows, clients and
 staleness reach no further back. State that reaches further (episodes, `for`, `cooldown`) is computed afterwards, from
@@ -45,7 +45,7 @@ class Cutting(NamedTuple):
 
     spans: list[PieceTimes]
     rules: frozenset[str]
-    """The rules for which it is exact."""
+    """The rules for which the cut is exact."""
     whole: dict[str, str]
     """The other rules, with the reasons."""
 

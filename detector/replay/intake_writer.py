@@ -1,7 +1,7 @@
 """Writes an intake file beside a running engine, which never waits for the disk.
 
 A bounded queue passes the data to a separate thread. If the disk is too slow and the queue is full, arrivals are
-dropped; that is counted, logged, and marked in the file, whose replay is then inexact.
+dropped; the drop is counted, logged and marked in the file, and the replay is inexact.
 """
 
 from __future__ import annotations

@@ -167,15 +167,15 @@ def latched_first(
     first: dict[tuple[str, Hashable], Arrival] = {}
     for arrival in latched:
         if arrival.stream in topics:
-            first.setdefault(_about(arrival, topics), arrival)
+            first.setdefault(_topic_of(arrival, topics), arrival)
     taken: set[tuple[str, Hashable]] = set()
 
     def is_moved(arrival: Arrival) -> bool:
         """Whether the arrival, of a latched stream, was moved to the beginning."""
-        about = _about(arrival, topics)
-        if about in taken:
+        topic = _topic_of(arrival, topics)
+        if topic in taken:
             return False
-        taken.add(about)
+        taken.add(topic)
         return True
 
     for number, arrivals in enumerate(recorded):
@@ -185,5 +185,5 @@ def latched_first(
             yield rest
 
 
-def _about(arrival: Arrival, topics: dict[str, Topic]) -> tuple[str, Hashable]:
+def _topic_of(arrival: Arrival, topics: dict[str, Topic]) -> tuple[str, Hashable]:
     return arrival.stream, topics[arrival.stream](arrival.key, arrival.payload)

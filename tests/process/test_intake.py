@@ -144,11 +144,11 @@ def test_all_samples_of_a_message_share_its_time() -> None:
 
 def test_a_lossless_put_waits_for_room_up_to_a_timeout() -> None:
     intake = Intake(Clock(1), maximum_bytes=SAMPLE_OVERHEAD)
-    put = intake.patient_putter("tokens", patience=0.02)
+    put = intake.blocking_putter("tokens", timeout=0.02)
     put([("k", b"first")])
     put([("k", b"given up")])
     assert intake.dropped == 1
-    patient = intake.patient_putter("tokens", patience=PATIENCE)
+    patient = intake.blocking_putter("tokens", timeout=PATIENCE)
     waiting = threading.Thread(target=patient, args=([("k", b"second")],))
     waiting.start()
     assert [arrival.payload for arrival in intake.drain(2)] == [b"first"]

@@ -28,7 +28,7 @@ class CompiledSignal:
     parameters: Parameters = NO_PARAMETERS
     """The `parameters` for value and where, by client."""
     rule: str | None = None
-    """The rule whose episode starts or ends are the samples; None if they come from a stream."""
+    """The rule whose episode starts or ends are the samples; None if the samples come from a stream."""
     element: CompiledElement | None = None
     """The element for which it is computed, if value or where reads the element."""
     quantile: float | None = None
@@ -90,7 +90,7 @@ class CompiledPosition:
 
     @property
     def geographic(self) -> bool:
-        """Whether it is in degrees on the Earth; otherwise it is in metres."""
+        """Whether the position is in degrees on the Earth; otherwise in metres."""
         return "latitude" in self.axes
 
 
@@ -170,7 +170,7 @@ class CompiledWindow:
 
     streams: frozenset[str]
     latched: frozenset[str]
-    """Streams whose last samples are included, however old they are."""
+    """Streams whose last samples are included at any age."""
     shared: frozenset[str]
     """The latched streams that belong to one client named by the Detector: they are included for every client."""
     clients: frozenset[str] | None

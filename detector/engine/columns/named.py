@@ -1,4 +1,4 @@
-"""Signals that name the client whose samples they aggregate: computed for that client only, the same for all others."""
+"""Signals that name the client whose samples they aggregate: computed for that client only, and used for all others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Computed(Protocol):
         """Compute all signals of a block that contains only this client."""
 
     def place(self, row: int, name: str) -> int:
-        """The index of a track's signal among them."""
+        """The index of a track's signal among the signals of the client."""
 
 
 class NamedSignals:
@@ -30,7 +30,7 @@ class NamedSignals:
         self._places: list[tuple[int, Track, str]] = []
 
     def add(self, at: int, track: Track, name: str) -> None:
-        """Add such a signal of a track, with its index in the group."""
+        """Add a track's signal that names a client, with its index in the group."""
         self._places.append((at, track, name))
 
     def compute(self, context: Context, block: Block, floor: int | None) -> dict[int, Column]:

@@ -28,7 +28,7 @@ class Nearby(NamedTuple):
     """The clients' indices."""
     distance: Doubles
     left_out: int
-    """How many pairs within reach were left out."""
+    """The number of pairs within reach that exceeded the maximum."""
 
 
 class ClientPositions(NamedTuple):
@@ -82,7 +82,7 @@ def nearby(clients: ClientPositions, subject: PairSubject) -> Nearby:
 
 
 def _most(points: Doubles, radius: float) -> int:
-    """An upper bound of the ordered pairs of points within the radius; takes a tenth of the time to count them.
+    """An upper bound of the ordered pairs of points within the radius; costs a tenth of counting them.
 
     Such a pair lies in one cell of a grid or in two neighbouring ones, and over all cells c the sum of the products of
     neighbours' counts n(c)·n(c + d) is at most that of n(c)² (Cauchy and Schwarz). Cells that share a bucket only
@@ -96,7 +96,7 @@ def _most(points: Doubles, radius: float) -> int:
 
 
 def _crowded(clients: ClientPositions, subject: PairSubject, first: Integers, second: Integers) -> Nearby:
-    """Far more pairs than the subject's maximum: avoids creating them all."""
+    """The nearest pairs if far more are within reach than the maximum: does not create all of them."""
     names = clients.names
     index = {names[at]: at for at in np.union1d(first, second).tolist()}
 

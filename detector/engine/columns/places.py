@@ -22,7 +22,7 @@ class Places(NamedTuple):
     axes: Doubles
     """Shape (axes, n); metres or degrees."""
     known: Truths
-    """Which of them are known; the values of the others are arbitrary."""
+    """Which places are known; the values of the others are arbitrary."""
 
     def of(self, at: Integers) -> Places:
         """Select the places at these indices, in this order."""
@@ -72,7 +72,7 @@ class PositionColumns:
         return Places(axes, known), rows
 
     def times(self, rows: Integers) -> Integers:
-        """The times of the samples in these rows."""
+        """The times of the samples in the given rows."""
         times: Integers = self._table.times[rows]
         return times
 

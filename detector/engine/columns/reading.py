@@ -75,7 +75,7 @@ class Reader:
         self._graph = Graph()
         self._index: dict[Hashable, int] = {}
         self._readings: list[SampleExpression] = []
-        """By column; the first of equal ones."""
+        """By column: the first of equal expressions."""
         self._nodes: list[int | None] = []
         self._used: dict[UsedColumns, None] = {}
         self._paths: list[Path] = []
@@ -240,7 +240,7 @@ class Reader:
     def _explained(
         self, batch: _Batch, at: int, rows: Sequence[int], failed: Mapping[int, tuple[Reason, str]]
     ) -> Iterator[Failure]:
-        """Rows that look the same to the columns share one explanation, which CEL gives for the first."""
+        """Rows with the same tags share one explanation, which CEL gives for the first of them."""
         known: dict[Hashable, tuple[Reason | None, str]] = {}
         counts: dict[tuple[int, Reason | None, str], int] = {}
         kinds = [None if each.tags is None else each.tags for each in batch.leaves.columns]
@@ -251,10 +251,10 @@ class Reader:
             elif row in failed:
                 why = failed[row]
             else:
-                alike = tuple([Tag.NUMBER if each is None else int(each[row]) for each in kinds])
-                if alike not in known:
-                    known[alike] = self._value_by_cel(at, batch, row)[1] or (None, "")
-                why = known[alike]
+                tags = tuple([Tag.NUMBER if each is None else int(each[row]) for each in kinds])
+                if tags not in known:
+                    known[tags] = self._value_by_cel(at, batch, row)[1] or (None, "")
+                why = known[tags]
             which = (int(batch.clients[row]), *why)
             counts[which] = counts.get(which, 0) + 1
         for (client, reason, message), count in counts.items():

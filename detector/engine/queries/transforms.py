@@ -22,7 +22,7 @@ from wayside.expressions import UNKNOWN
 
 _CLIENT = "${client}"
 
-_REMEMBERED = 10_000_000_000
+_CACHE_DURATION = 10_000_000_000
 """Nanoseconds for which transforms stay cached after their last use."""
 
 
@@ -64,17 +64,17 @@ class Transforms:
         self._messages = messages
         self._counters = counters
         self._parsed: dict[tuple[str, str], dict[Sample, _Parsed]] = {}
-        """By client and stream; only of samples in the buffer."""
+        """By client and stream; only samples in the buffer."""
         self._used: dict[tuple[str, str], int] = {}
-        """When these were last used; nanoseconds."""
+        """By client and stream, when `_parsed` was last used; nanoseconds."""
         self._trees: dict[str, _Tree] = {}
         """The trees of the current tick."""
 
     def forget(self, now: int) -> None:
-        """The tick is over. Drop entries that were not used lately: they may refer to samples that the buffer
-        has dropped."""
+        """The tick is over. Drop entries without recent use: they may refer to samples that the buffer has
+        dropped."""
         self._trees.clear()
-        for place in [place for place, used in self._used.items() if not 0 <= now - used <= _REMEMBERED]:
+        for place in [place for place, used in self._used.items() if not 0 <= now - used <= _CACHE_DURATION]:
             del self._used[place], self._parsed[place]
 
     def lookup(self, client: str, target: str, source: str, stamp: int | None, now: int) -> Pose:

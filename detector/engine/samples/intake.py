@@ -1,9 +1,9 @@
-"""The one place where samples get their receive time.
+"""Assigns the receive time of all samples.
 
-The thread that receives a message stamps and queues it without a lock: a lock would cost more than all the rest. Two
+The thread that receives a message stamps and queues it without a lock: a lock would cost more than both steps. Two
 threads may therefore queue out of order by a few microseconds, and a thread may pause between stamping and queueing.
 `drain` makes the times monotonic: they never go back, and all are later than those drained before and than the last
-`until`. No sample ever belongs to a time whose tick has run. Samples of equal time are drained together, in their
+`until`. No sample has a time whose tick has already run. Samples of equal time are drained together, in their
 order.
 """
 
@@ -47,7 +47,7 @@ class Intake:
         self.urgent: frozenset[str] = frozenset()
         """Streams whose messages should be drained at once."""
         self.on_urgent: Callable[[], None] = lambda: None
-        """Called after messages of such a stream were queued, by the thread that queued them."""
+        """Called after messages of an urgent stream were queued, by the thread that queued them."""
 
     def putter(self, *streams: str) -> Put:
         """A function that takes messages: the key and the payload of each. Thread-safe; never waits.
@@ -77,22 +77,22 @@ class Intake:
 
         return put
 
-    def patient_putter(self, stream: str, patience: float = 1.0) -> Put:
-        """The same for rare messages that should not be dropped: it waits for room, at most `patience` seconds."""
+    def blocking_putter(self, stream: str, timeout: float = 1.0) -> Put:
+        """A putter for rare messages that should not be dropped: waits for room, at most `timeout` seconds."""
         put = self.putter(stream)
         pause = threading.Event()
 
-        def patient(messages: Sequence[tuple[str, bytes]]) -> None:
+        def put_when_room(messages: Sequence[tuple[str, bytes]]) -> None:
             waited = 0.0
-            while self._room <= 0 and waited < patience:
+            while self._room <= 0 and waited < timeout:
                 pause.wait(_PAUSE)
                 waited += _PAUSE
             put(messages)
 
-        return patient
+        return put_when_room
 
     def drain(self, until: int) -> list[Arrival]:
-        """The queued messages, in order. Later ones will be later than all of these, and than `until`."""
+        """The queued messages, in time order. Messages drained later have later times, also later than `until`."""
         arrivals = self._queue[:]
         del self._queue[: len(arrivals)]
         self._room = self._maximum_bytes

@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 Pair = tuple[str, str]
 
 Distance = Callable[[str, str], float]
-"""Between two clients, in metres, as in expressions."""
+"""The distance between two clients in metres, as in expressions."""
 
 FEW = 1024
 """Maximum number of pairs for which comparing all is faster than building trees."""
 
 _ROUNDING = 1 + 1e-9
-_SLACK = 1e-6
+_TOLERANCE = 1e-6
 """The trees search slightly beyond the limit, by this factor and this number of metres, so that rounding hides no pair;
 `distance` decides. Points on the Earth are 6,400 km from the origin, so they are exact to a nanometre only."""
 
 ROOM = 4
 """Up to this multiple of the requested number of pairs is created, to be sorted exactly."""
 
-_HALVINGS = 40
+_MAXIMUM_BISECTIONS = 40
 
 
 class Near(NamedTuple):
@@ -40,8 +40,8 @@ class Near(NamedTuple):
 
     pairs: list[Pair]
     left_out: int
-    """How many pairs within reach were left out because of the maximum number. With many clients it may include pairs
-    that are out of reach by a micrometre or a billionth."""
+    """The number of pairs within reach that exceeded the maximum. With many clients it may include pairs that are
+    out of reach by a micrometre or a billionth."""
 
 
 class Search(NamedTuple):
@@ -58,7 +58,7 @@ class Search(NamedTuple):
 
 def reach(within: float) -> float:
     """How far trees search for pairs that are at most `within` metres apart."""
-    return within * _ROUNDING + _SLACK
+    return within * _ROUNDING + _TOLERANCE
 
 
 def near_pairs(search: Search, within: float, maximum: int) -> Near:
@@ -75,7 +75,7 @@ def _fits(search: Search, a: str, b: str) -> bool:
 
 
 def _nearest(search: Search, pairs: Iterator[Pair], within: float, maximum: int) -> Near:
-    """The pairs among these that are within reach, exactly."""
+    """The given pairs that are within reach by their exact distance; at most `maximum`, the nearest."""
     measured = [(search.distance(a, b), a, b) for a, b in pairs if _fits(search, a, b)]
     reached = [each for each in measured if each[0] <= within]
     if len(reached) <= maximum:
@@ -102,7 +102,7 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
     if found <= maximum * ROOM:
         return _nearest(search, _all(one, other, first, second, radius), within, maximum)
     low, high = 0.0, radius
-    for _ in range(_HALVINGS):
+    for _ in range(_MAXIMUM_BISECTIONS):
         middle = (low + high) / 2
         number = count(middle)
         if number < maximum:
@@ -114,14 +114,14 @@ def _by_trees(search: Search, first: list[str], second: list[str], within: float
     if count(high) <= maximum * ROOM:
         pairs = _nearest(search, _all(one, other, first, second, high), within, maximum).pairs
     else:
-        # Very many are equally far apart: take the nearer ones, then by names up to the maximum.
+        # Too many pairs have the same distance: take the nearer pairs, then the others by name, up to the maximum.
         nearer = _nearest(search, _all(one, other, first, second, low), within, maximum).pairs if low else []
         pairs = _filled(search, nearer, _between(one, other, first, second, high), within, maximum)
     return Near(pairs, found - len(pairs))
 
 
 def _all(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
-    """The pairs between both, found at once."""
+    """The pairs between the two trees, from one query."""
     if one is other:
         for i, j in one.query_pairs(radius, output_type="ndarray").tolist():
             yield first[i], first[j]
@@ -133,7 +133,7 @@ def _all(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radi
 
 
 def _between(one: cKDTree, other: cKDTree, first: list[str], second: list[str], radius: float) -> Iterator[Pair]:
-    """The pairs between both, by names; created one client at a time."""
+    """The pairs between the two trees, by names, from one query per client."""
     for index, name in enumerate(first):
         for near in sorted(other.query_ball_point(one.data[index], radius)):
             yield name, second[near]

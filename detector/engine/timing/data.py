@@ -1,8 +1,8 @@
 """Clock Data: a sample's time is the sender's stamp, and the samples advance the time.
 
 Tick t runs once a stamp was seen that is at least t + lateness, and later than t. Samples of equal stamps that arrive
-in order are therefore all there by then, even with a lateness of zero. At the end, the ticks up to the newest stamp
-run.
+in order are therefore all inserted before their tick, even with a lateness of zero. At the end, the ticks up to the
+newest stamp run.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from detector.engine.timing.steps import Gap, Insert, Step, Tick
 
 
 @dataclass(slots=True)
-class _Row:
+class _JumpCandidate:
     """Consecutive samples whose stamps agree with each other, but not with the time axis."""
 
     client: str
@@ -26,14 +26,14 @@ class _Row:
     last: int
     received: int
     several: bool = False
-    """Whether they come from more than one client."""
+    """Whether the samples come from more than one client."""
 
 
 class DataTimeline:
     """Clock Data: time is the senders' stamps.
 
     A sample waits until the next tick after it, and then enters in the order of the stamps: the order in which samples
-    arrive does not matter as long as `lateness` covers it. A sample that is later than that enters at once.
+    arrive does not matter as long as `lateness` covers it. A sample that arrives after its tick is inserted at once.
 
     A stamp is dropped and counted if it is more than `max_ahead` ahead of the time expected by now (receive times show
     how long nothing arrived), or so far behind that the buffer has no room for it. If time really jumped (a pause in a
@@ -87,7 +87,7 @@ class DataTimeline:
         self._number = 0
         self._some_client: str | None = None
         self._several_clients = False
-        self._row: _Row | None = None
+        self._candidate: _JumpCandidate | None = None
         self._early: list[tuple[int, Arrival]] = []
         """Latched samples that arrived before the first stamp, with their stamps."""
         self.latched = latched
@@ -97,7 +97,7 @@ class DataTimeline:
         self.dropped_late = 0
         self.dropped_full = 0
         self.last = ""
-        """The sample last dropped because of its time, and how far off it was."""
+        """A text about the last sample dropped because of its time, with its distance from the time axis."""
         self.jumps = 0
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
@@ -119,7 +119,7 @@ class DataTimeline:
                 newest = stamp
                 yield self._begin(stamp, backwards=False)
             elif newest - self.max_behind <= stamp <= newest + self._allowed_lead(arrival, self._newest_received):
-                self._row = None
+                self._candidate = None
                 if not self._ticked and newest - self._lateness <= stamp <= self.now:
                     yield self._begin(stamp, backwards=False)  # the first sample to arrive was not the earliest
                 newest = max(newest, stamp)
@@ -227,7 +227,7 @@ class DataTimeline:
             yield Insert(arrivals, times)
 
     def _note_client(self, client: str) -> None:
-        """Note whether samples come from several clients."""
+        """Record whether samples come from several clients."""
         if self._some_client is None:
             self._some_client = client
         elif client != self._some_client:
@@ -238,16 +238,18 @@ class DataTimeline:
         return self._max_ahead + max(0, arrival.received - since)
 
     def _jumped(self, arrival: Arrival, client: str, stamp: int, newest: int) -> bool:
-        """Whether this sample, which does not fit, shows that time jumped; otherwise it is dropped."""
-        row = self._row
-        if row is not None and -self._max_ahead <= stamp - row.last <= self._allowed_lead(arrival, row.received):
-            row.several = row.several or client != row.client
-            row.last, row.received = stamp, arrival.received
-            if row.several or not self._several_clients or abs(stamp - row.first) >= self.alone_after:
-                self._row = None
+        """Whether this sample, whose stamp is out of range, proves a jump of time; otherwise counts it as dropped."""
+        candidate = self._candidate
+        if candidate is not None and (
+            -self._max_ahead <= stamp - candidate.last <= self._allowed_lead(arrival, candidate.received)
+        ):
+            candidate.several = candidate.several or client != candidate.client
+            candidate.last, candidate.received = stamp, arrival.received
+            if candidate.several or not self._several_clients or abs(stamp - candidate.first) >= self.alone_after:
+                self._candidate = None
                 return True
         else:
-            self._row = _Row(client, stamp, stamp, arrival.received)
+            self._candidate = _JumpCandidate(client, stamp, stamp, arrival.received)
         way = "ahead of" if stamp > newest else "behind"
         self.last = f"{client} is {abs(stamp - newest) / 1e9:g} s {way} the rest on stream {arrival.stream}"
         if stamp > newest:

@@ -7,7 +7,7 @@ one of their timers (for, cooldown, unknownTimeout) expires. A rule with `onDema
 
 While the machine is too slow, evaluations are skipped, by a level that the caller gives. Each class of rules with the
 same priority, from the lowest, is thinned in three steps: every second evaluation, every fourth, every eighth. The next
-class begins when the one below it has reached its last step. At level 0 no evaluation is skipped.
+class is thinned once the class below it has reached its last step. At level 0 no evaluation is skipped.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Ticks:
     def __init__(self) -> None:
         self._periods: tuple[int, ...] = (HOUSEKEEPING,)
         self._wakes: list[int] = []
-        """A heap; past entries are dropped when they are met."""
+        """A heap; past entries are removed when they reach the top."""
         self.triggers: frozenset[str] = frozenset()
         """The streams whose samples are evaluated at their own times."""
 
@@ -88,12 +88,12 @@ class SubjectFilter(NamedTuple):
         return any(client in self.clients for client in subject.clients) if subject.clients else bool(self.clients)
 
     def present(self, clients: Clients) -> list[str]:
-        """The clients that can form its single-client subjects, in order of their names."""
+        """The known clients of the selection, sorted by name."""
         return sorted([client for client in self.named if client in clients])
 
     @property
     def named(self) -> frozenset[str]:
-        """The clients, and those of the subjects."""
+        """The selected clients, and the clients of the selected subjects."""
         return self.clients.union(*(subject.clients for subject in self.subjects)) if self.subjects else self.clients
 
 
@@ -112,7 +112,7 @@ class Schedule:
         self._priorities: frozenset[int] = frozenset()
         self._thinning: Mapping[int, int] = {}
         self._only = SubjectFilter(_NOBODY, frozenset())
-        """The last selection without single subjects: mostly that of all rules."""
+        """The last selection without single subjects, cached: most rules share it."""
         self.paused: frozenset[str] = frozenset()
         """The names of paused rules."""
         self.level = 0
@@ -203,10 +203,10 @@ class Overload:
     def __init__(self) -> None:
         self.level = 0
         self._since = 0
-        """When the last slow cycle, or the last step down, was."""
+        """The time of the last slow cycle or of the last decrease of the level; nanoseconds."""
 
     def observe(self, now: int, spent: int, highest: int) -> bool:
-        """A cycle ended `now` that took `spent` nanoseconds; returns whether the level changed.
+        """Called at the end of a cycle that took `spent` nanoseconds; returns whether the level changed.
 
         `highest`: the level at which thinning reaches its maximum.
         """

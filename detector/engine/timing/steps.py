@@ -13,8 +13,8 @@ recorded.
 
 A file without a version has order 1. There, with clock Data and a lateness of zero, a tick runs with the first stamp of
 its time; with clock Wall, samples received during a stall are evaluated at their own times, after the gap. `distance`
-and `closingSpeed` have the values of that version, to the last digit; the second of `closingSpeed` ends now, however
-old places are.
+and `closingSpeed` have the exact values of that version; the second over which `closingSpeed` is computed ends now, at
+any age of the places.
 """
 
 

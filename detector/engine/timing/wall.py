@@ -14,7 +14,7 @@ from detector.engine.timing.steps import Gap, Insert, Step, Tick
 
 
 class WallTimeline:
-    """Clock Wall: time is when samples were received."""
+    """Clock Wall: time is the receive time of samples."""
 
     def __init__(self, ticks: Ticks, start: int, *, exact: bool = True) -> None:
         """`exact`: see `steps.ORDER`; False is order 1."""
@@ -24,10 +24,10 @@ class WallTimeline:
         """All ticks up to this time have run."""
 
     def steps(self, arrivals: Sequence[Arrival], until: int) -> Iterator[Step]:
-        """All that happens up to `until`, or up to the last arrival if that is later.
+        """All steps up to `until`, or up to the last arrival if that is later.
 
-        The arrivals are in time order, and those of a later call are later than these and than `until`. Therefore the
-        ticks up to there can run, and each sees all samples up to its time.
+        The arrivals are in time order. The arrivals of later calls are later than these arrivals and than `until`:
+        each tick up to that time sees all of its samples.
         """
         first, count = 0, len(arrivals)
         if count:
@@ -65,11 +65,11 @@ class WallTimeline:
         yield Gap(time, backwards)
 
     def rest(self) -> Iterator[Step]:
-        """Nothing is waiting here."""
+        """No step: this time axis queues no samples."""
         yield from ()
 
     def finish(self) -> Iterator[Step]:
-        """All ticks up to now have run."""
+        """No step: all ticks up to `now` have run."""
         yield from ()
 
 
