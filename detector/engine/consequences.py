@@ -29,7 +29,7 @@ class EpisodeSample(NamedTuple):
     key: str
     """The full key of the message, without a leading slash."""
     time: int
-    """Its time on the detector's time axis, in nanoseconds since the epoch."""
+    """The message's time on the detector's time axis, in nanoseconds since the epoch."""
     received: int
     """Nanoseconds since the epoch; the stamp as well with clock Data."""
     payload: bytes
@@ -54,7 +54,7 @@ class Excerpt:
     waiting: list[tuple[Lane, Sample]] = field(default_factory=list)
     """Samples that are later than the engine's time, or not drained yet."""
     lanes: list[Lane] = field(default_factory=list)
-    """The lanes of its samples."""
+    """The lanes of the excerpt's samples."""
 
     def matches(self, lane: Lane) -> bool:
         """Whether the lane belongs to the window's streams and clients."""

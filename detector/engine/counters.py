@@ -10,7 +10,7 @@ from typing import Protocol
 from wayside.expressions import Reason
 
 OLD = 3
-"""In usual periods: an older sample shows that its sender fell silent."""
+"""Age limit in usual periods: an older sample shows that its sender fell silent."""
 
 _MANY, _SHARE = 10, 0.1
 """Uses of old samples are reported from this number and this share on: a client that leaves always causes a few."""
@@ -138,7 +138,7 @@ class RuleCounters:
     ticks: int = 0
     """Number of ticks at which the rule was evaluated, each for all its subjects."""
     last_tick: int = 0
-    """The newest of these times, in nanoseconds on the engine's time axis."""
+    """The time of the newest of these ticks, in nanoseconds on the engine's time axis."""
     time_ns: int = 0
     """Time spent on its evaluation, by the engine's stopwatch."""
 
@@ -150,7 +150,7 @@ class RuleCounters:
     evaluation."""
     last_unfollowed: str = ""
     ages: Ages | None = None
-    """The age of the samples that it used; None if not measured."""
+    """The ages of the samples that the rule used; None if not measured."""
     notes: list[str] | None = None
     """If set, collects what expressions missed or failed on; at most a thousand entries."""
 
@@ -190,7 +190,7 @@ class Counters:
     unnamed: Counter[str] = field(default_factory=Counter)
     """Samples dropped since neither their key nor their message names a valid client, by stream."""
     last_unnamed: dict[str, str] = field(default_factory=dict)
-    """The key of the last one, and the invalid name in its message, by stream."""
+    """The key and the invalid name of the last sample in `unnamed`, by stream."""
     unstamped: Counter[str] = field(default_factory=Counter)
     """With clock Data, samples without a stamp, by stream: their receive time is used instead."""
     zeros: Counter[str] = field(default_factory=Counter)

@@ -51,7 +51,7 @@ class Observation:
 
     @property
     def code(self) -> int:
-        """The same in one byte."""
+        """The observation in one byte."""
         may = both(both(self.in_scope, self.near), both(self.when, negation(self.until)))
         start = TRUE if may is True else FALSE if may is False else UNSURE
         if self.in_scope is False:

@@ -149,7 +149,7 @@ class Blocks:
                 self._ahead += self._noted(self._evaluated(group, ticks, clients, stopwatch))
 
     def run(self, stopwatch: Callable[[], int]) -> list[OrderedEvent]:
-        """Evaluate all queued ticks; returns what happened, in order."""
+        """Evaluate all queued ticks; returns the events, in order."""
         happened, self._ahead = self._ahead, []
         clients = [*self._context.clients]
         for groups in self._depths:

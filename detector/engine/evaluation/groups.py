@@ -300,6 +300,6 @@ def _with_effect(subjects: Integers, effects: Codes, timed: Truths, watched: Tru
 
 
 def _shifted(subjects: Integers, effects: Codes, first: NDArray[Any]) -> NDArray[Any]:
-    """The effect before each one of the same subject; `first` for its first."""
+    """The previous effect of the same subject, for each effect; `first` for the first of a subject."""
     begins = np.concatenate(([True], subjects[1:] != subjects[:-1]))
     return np.where(begins, first, np.roll(effects, 1))

@@ -26,7 +26,7 @@ class TrackedPairs(NamedTuple):
     """The pairs that have a state, in any order."""
 
     keys: Integers
-    """The numbers of both clients, combined in one integer."""
+    """The numbers of both clients, packed into one integer."""
     last: NDArray[np.uint8]
     """The previous observation."""
     wakes: Integers
@@ -37,7 +37,7 @@ class TrackedPairs(NamedTuple):
     """The bits of an observation that count: those that end an open episode, else those that start one."""
 
     def of(self, at: Integers | Truths) -> TrackedPairs:
-        """Select these."""
+        """Select the pairs at these indices."""
         return TrackedPairs(self.keys[at], self.last[at], self.wakes[at], self.in_progress[at], self.matters[at])
 
 
@@ -52,7 +52,7 @@ _STARTS, _ENDS = 3, 12
 
 
 class PairGroup:
-    """One rule about pairs, with the same interface as `RuleGroup`."""
+    """A rule about pairs, with the interface of `RuleGroup`."""
 
     width = 1
     may_wait = False  # samples that cannot be read are counted at each tick that reads them
