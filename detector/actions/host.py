@@ -1,7 +1,7 @@
 """Runs the actions of all rules, follows changes of the rules, and stops them cleanly.
 
 engine ─▶ consequences ─▶ host ─▶ a worker with a separate thread for each action of each rule
-                                      └▶ outcomes: status, follow-ups on Zenoh
+                                      └▶ outcomes: status, progress events on Zenoh
 """
 
 from __future__ import annotations

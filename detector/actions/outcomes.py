@@ -1,8 +1,8 @@
-"""The outcomes of actions: kept by action for the status, and published as follow-ups on Zenoh.
+"""The outcomes of actions: kept by action for the status, and published as progress events on Zenoh.
 
     wayside/actions/<holder>/<rule>/<episode>/<action>
 
-A follow-up is a CloudEvent, like an event: dev.wayside.action.running, .done or .failed.
+A progress event is a CloudEvent, like an event: dev.wayside.action.running, .done or .failed.
 """
 
 from __future__ import annotations

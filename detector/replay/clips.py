@@ -74,7 +74,7 @@ class Recorders:
 
 
 class _NoMessenger:
-    """Discards the follow-ups of a replay."""
+    """Discards the progress events of a replay."""
 
     def publish(self, key: str, payload: bytes, encoding: str) -> None:
         """See `Messenger`."""

@@ -85,7 +85,7 @@ def _show(
 
 
 _OURS = "wayside/"
-"""Keys of detectors: events, follow-ups and responses."""
+"""Keys of detectors: events, progress events and responses."""
 _ENCODINGS = {"application/json": Encoding.JSON, "application/cbor": Encoding.CBOR, "application/cdr": Encoding.CDR}
 
 
